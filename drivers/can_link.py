@@ -20,11 +20,17 @@ from drivers.device_watch import DeviceWatch, no_watch, watch_interface, watch_p
 from drivers.errors import DeviceError, LinkError
 from drivers.outage import Backoff, Outage
 from drivers.readings import CanCapture, Capture, DeviceEvent, EventKind, Gap, GapReason
-from drivers.stall_detector import CLOCK_WAS_SET, NOT_READ_IN_TIME, LateReport, StallDetector
+from drivers.stall_detector import (
+    CLOCK_WAS_SET,
+    NOT_READ_IN_TIME,
+    REST_READ_S,
+    REST_S,
+    LateReport,
+    StallDetector,
+)
 
 POLL_S = 0.05  # how long a stop or a set-up request may go unnoticed
 LOSS_CHECK_NS = NS_PER_S
-REST_S = 2.0  # real seconds for which what still waits is read when the link is to stop
 
 Emit = Callable[[Capture | DeviceEvent | Gap], None]
 
@@ -101,9 +107,9 @@ class CanLink:
             self._requests += wanted
 
     def publish(self, frames: Sequence[Frame]) -> None:
-        """Send rigcal's own frames soon; may be called from any thread.
+        """Send rigcal's own frames at the next opportunity; may be called from any thread.
 
-        Frames that are still waiting are replaced: what is late is never sent in a burst.
+        Only the frames of the newest call wait, and not beyond the opening of the bus: what is old is never sent.
 
         Raises:
             TransmitForbiddenError: the link is listen-only, or an identifier is none of its own. Nothing is sent then.
@@ -132,7 +138,10 @@ class CanLink:
         return DeviceError(self.name, "nothing can be set up: the link is not open; ask again when it is up")
 
     def run(self, emit: Emit, stop: threading.Event) -> None:
-        """Receive until `stop` is set, opening the bus again whenever it is lost."""
+        """Receive until `stop` is set, opening the bus again whenever it is lost.
+
+        What waits to be read by then is read for `REST_S` at most, and nothing more is sent.
+        """
         backoff = Backoff()
         outage = Outage(self.name, emit)
         self._last_frame = self._clock.now()
@@ -157,6 +166,7 @@ class CanLink:
             watch.close()
             at_start, self._at_start = self._at_start, []
             self._swap_requests(at_start)
+            self._published.clear()
             rest: TimeBudget | None = None
             try:
                 self.read_until = session.read_until
@@ -165,13 +175,14 @@ class CanLink:
                     session.take(read)
                     if read.batch.received:
                         backoff.reset()
-                    session.serve(self._swap_requests([]), self._take_published())
-                    self.read_until = session.read_until
                     if rest is not None and (read.batch.is_last or rest.is_over):
                         return
-                    if stop.is_set() and rest is None:
-                        rest = TimeBudget(REST_S)
-                    read = session.read(0.0 if rest else session.patience_s())
+                    if stop.is_set():
+                        rest = rest or TimeBudget(REST_S)
+                    else:
+                        session.serve(self._swap_requests([]), self._take_published())
+                        self.read_until = session.read_until
+                    read = session.read(REST_READ_S if rest else session.patience_s())
             finally:
                 cause = "rigcal was stopped" if stop.is_set() else "the link was lost"
                 session.close(self._swap_requests(None), cause)

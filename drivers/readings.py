@@ -218,7 +218,7 @@ class GapReason(StrEnum):
 
     SILENT = "silent"  # the device is there no more, or was never
     LINK_DOWN = "link_down"
-    FRAMES_LOST = "frames_lost"  # sequence or rate shows that some did not arrive
+    FRAMES_LOST = "frames_lost"  # on the bus, in the kernel, in the adapter or in rigcal's queue
     TIME_DOUBTFUL = "time_doubtful"  # captures are stored, but none of them may be used: their time is not known
     LOCK_LOST = "lock_lost"
     NOT_RUNNING = "not_running"  # the daemon itself was not there
@@ -229,7 +229,7 @@ class Gap:
     """A stretch in which a channel gave nothing. Reported when it opens (`end` None) and again when it closes.
 
     Attributes:
-        channel: joint value, signal or station.
+        channel: joint value, signal, station or link; `daemon` for rigcal itself.
         reason: see GapReason.
         start: the last instant at which the channel was known to be good.
         end: the first instant at which it was good again; None while it lasts.
@@ -260,14 +260,14 @@ LinkItem = Capture | DeviceEvent | Gap
 
 
 class LinkLoop(Protocol):
-    """The thin loop that owns one port: opens it, reads it, opens it again when it goes away. It decodes nothing.
+    """The thin loop that owns one port: opens it, reads it, opens it again when it goes away. It decodes nothing."""
 
-    Attributes:
-        read_until: all that the port had received by then has been handed on, and what was lost has been told; None
-            where nothing waits to be read, as while the port is not open, which has been told as well.
-    """
+    @property
+    def read_until(self) -> Stamp | None:
+        """All that the port had received by then has been handed on, and what was lost has been told.
 
-    read_until: Stamp | None
+        None where nothing waits to be read, as while the port is not open, which has been told as well.
+        """
 
     @property
     def name(self) -> str:

@@ -20,10 +20,14 @@ class ReplayLink:
 
     def __init__(self, name: str, captures: Iterable[Capture], clock: Clock) -> None:
         self.name = name
-        self.read_until: Stamp | None = None
         self.is_finished = threading.Event()
         self._captures = captures
         self._clock = clock
+
+    @property
+    def read_until(self) -> Stamp:
+        """Now: nothing is received that would wait to be read."""
+        return self._clock.now()
 
     def run(self, emit: Callable[[LinkItem], None], stop: threading.Event) -> None:
         """Hand on everything, then stay silent until `stop`."""

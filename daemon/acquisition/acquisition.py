@@ -12,6 +12,7 @@ import heapq
 import logging
 import sqlite3
 import threading
+import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -51,7 +52,7 @@ ALIVE_NS = NS_PER_S
 RETRY_S = 1.0
 STOP_S = 15.0  # real seconds
 LINKS_STOP_S = 5.0  # of them for all links together, which look at `stop` several times a second
-LAST_RETRIES = 3  # when stopping; then what could not be stored is given up, and the log says how much
+LAST_RETRIES = 3  # when stopping, RETRY_S apart; then what could not be stored is given up, and the log says how much
 INLINE_CAPTURES = 4096
 INLINE_SPAN_NS = NS_PER_S
 
@@ -154,7 +155,7 @@ class Acquisition:
         self._writer.join(budget.left_s)
         if self._writer.is_alive():
             log.critical("%s: a write does not end; it is left behind", self._store.path)
-        lost = self._unstored + sum(intake.queued for intake in self._intakes)
+        lost = self._unstored + sum(intake.unstored for intake in self._intakes)
         if lost:
             self._give_up(f"{lost} captures could not be stored before the end")
         elif self._decoded is not None or not self._backlog.is_empty:
@@ -176,13 +177,13 @@ class Acquisition:
         return self._backlog.is_behind
 
     def check(self) -> None:
-        """Raise if the writer has ended; a disk that is full or slow is no reason to, it is waited for.
+        """Raise if acquisition has failed; a disk that is full or slow is no reason to, it is waited for.
 
         Raises:
-            AcquisitionError: the writer has ended, and nothing is stored any more.
+            AcquisitionError: the writer has ended by itself, or captures were given up when stopping.
         """
         if self._failure is not None:
-            raise AcquisitionError(f"the writer failed, nothing is stored any more: {self._failure}")
+            raise AcquisitionError(f"nothing is stored any more: {self._failure}")
 
     @property
     def has_stored_all(self) -> bool:
@@ -217,14 +218,13 @@ class Acquisition:
                 if not self._decode_next(self._clock.now()):
                     break
         except Exception as error:
-            # The thread ends here; `alive` and `status` tell.
             why = storage_sentence(self._store.path, error) if isinstance(error, sqlite3.DatabaseError) else None
             log.critical("the writer failed; nothing is stored any more: %s", why or error, exc_info=why is None)
             self._board.set_error(f"the writer failed: {error}; restart rigcal")
             self._failure = error
 
     def _read_until(self, now: Stamp) -> Stamp:
-        """Return until when all that has reached the computer has been captured: now, or where a link is behind."""
+        """Return until when all that the links received is queued; asked before the queues are drained."""
         links = [intake.read_until for intake in self._intakes]
         return min([now, *filter(None, links)], key=lambda stamp: stamp.monotonic_ns)
 
@@ -383,16 +383,17 @@ class Acquisition:
 
     def _insist(self, work: Callable[[], T]) -> T:
         """Do `work` and return its result, however long the disk is full or faulty; when stopping, only a few times."""
-        tries = 0
+        tries_left = LAST_RETRIES
         while True:
             try:
                 result = work()
             except sqlite3.DatabaseError as error:
-                tries += 1
-                if self._finish.is_set() and (tries > LAST_RETRIES or self._decode_until.is_over):
-                    raise
                 self._note_trouble("captures", error)
-                self._finish.wait(RETRY_S)
+                if self._finish.wait(RETRY_S):
+                    if not tries_left or self._decode_until.is_over:
+                        raise
+                    tries_left -= 1
+                    time.sleep(min(RETRY_S, self._decode_until.left_s))
                 self._last_cycle_ns = self._clock.monotonic_ns()
             else:
                 self._note_trouble("captures", None)

@@ -27,6 +27,7 @@ log = logging.getLogger(__name__)
 
 RESTART_S = 1.0
 LEFT_BEHIND_S = 10.0  # real seconds for which a link is waited for
+_LEFT_BEHIND_NS = 2 * NS_PER_S  # at least, where time runs slowly: links tell once a second how far they have read
 
 
 @dataclass(slots=True)
@@ -82,13 +83,23 @@ class LinkIntake:
 
     @property
     def read_until(self) -> Stamp | None:
-        """All that the link's port had received by then is queued, or its loss is told; None where nothing waits."""
+        """All that the link's port had received by then is queued, or its loss is told.
+
+        None where nothing waits, and where a gap says already that the link is not read.
+        """
         until = self._unread_since()
         return None if until == self._behind else until
 
     def _unread_since(self) -> Stamp | None:
         begun = self._begun
         return self._loop.read_until if begun is None else begun
+
+    @property
+    def unstored(self) -> int:
+        """Number of captures that wait, or found the queue full and are not told yet."""
+        waiting = sum(isinstance(item, CanCapture | SerialCapture) for item in self._queue.copy())
+        loss = self._loss
+        return waiting + (loss.count if loss is not None else 0)
 
     def drain(self) -> list[LinkItem]:
         """Return the items that wait, oldest first, and at their end a gap for those that were lost.
@@ -112,11 +123,17 @@ class LinkIntake:
             if behind is not None and since != behind:
                 self._behind = None
                 return [Gap(self.name, GapReason.LINK_DOWN, behind, since or now)]
-            waited_s = 0.0 if since is None else self._clock.real_seconds(now.since(since) / NS_PER_S)
-            if behind is None and waited_s > LEFT_BEHIND_S:
-                self._behind = since
-                return [Gap(self.name, GapReason.LINK_DOWN, since)] if since is not None else []
-            return []
+            until = self._loop.read_until
+            is_reading = (
+                since is not None and until is not None and until.since(since) > 0
+            )  # as a log is, from the start
+            if since is None or behind is not None or is_reading:
+                return []
+            waited_ns = now.since(since)
+            if waited_ns < _LEFT_BEHIND_NS or self._clock.real_seconds(waited_ns / NS_PER_S) < LEFT_BEHIND_S:
+                return []
+            self._behind = since
+            return [Gap(self.name, GapReason.LINK_DOWN, since)]
 
     def _end_of_start(self, begun: Stamp, item: LinkItem) -> None:
         """Tell of the time from the start of the run, or from the end of a loop that died, until the port is open."""

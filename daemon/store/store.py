@@ -60,7 +60,7 @@ class Store(Connection):
     Attributes:
         run_id: row of `daemon_runs`; 0 while no run has begun, and where its row cannot be written.
         begun: when the run began; None while none has.
-        previous_end: when the run before this one was last known to be alive; None before the first.
+        previous_end: when the run before this one ended, or was last known to be alive; None before the first.
         ended_in_order: whether the run before this one did; known once a run has begun, true before and without one.
 
     Raises:
@@ -85,7 +85,7 @@ class Store(Connection):
     # ---- runs of the daemon ----------------------------------------------------------------------------------------
 
     def begin_run(self, now: Stamp) -> None:
-        """Begin a run of the daemon: the time since the last one ended is a gap, and ends all gaps left open.
+        """Begin a run of the daemon: a gap covers the time since the last one's links were read, and open gaps end.
 
         Where a table of runs or gaps is damaged, the run begins without it, and counts as one after an unclean end.
         """
@@ -136,7 +136,7 @@ class Store(Connection):
         self.insert_records([Gap(WHOLE_DAEMON, GapReason.NOT_RUNNING, since, now)])
 
     def note_alive(self, until: Stamp) -> None:
-        """The running daemon has stored all that came `until` then: what its end loses, it loses after that.
+        """Record until when all that was received is stored: what the run's end loses came after that.
 
         Harmless when no run has begun.
         """

@@ -33,6 +33,7 @@ from can.interfaces.virtual import VirtualBus
 from drivers.can.frame import DATA_MAX, Frame, SlcanLines, parse_can_frame, parse_multicast
 from drivers.clock import NS_PER_S
 from drivers.errors import LinkError
+from drivers.stall_detector import more_may_wait
 
 Interface = Literal["socketcan", "virtual", "udp_multicast", "slcan"]
 
@@ -367,7 +368,7 @@ class SlcanPort(CanPort):
         if self._lines.malformed:
             self._count_lost(ADAPTER_LINE, self._lines.malformed)
             self._lines.malformed = 0
-        return Batch([Received(frame, None) for frame in frames], True)
+        return Batch([Received(frame, None) for frame in frames], not more_may_wait(data))
 
     def close(self) -> None:
         super().close()

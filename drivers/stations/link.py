@@ -6,12 +6,19 @@ import threading
 from collections.abc import Callable
 from contextlib import closing
 
-from drivers.clock import NS_PER_S, Clock, Stamp
+from drivers.clock import NS_PER_S, Clock, Stamp, TimeBudget
 from drivers.device_watch import watch_path
 from drivers.errors import LinkError
 from drivers.outage import BACKOFF_MAX_S, Backoff, Outage
 from drivers.readings import DeviceEvent, LinkItem, SerialCapture
-from drivers.stall_detector import NOT_READ_IN_TIME, LateReport, StallDetector
+from drivers.stall_detector import (
+    NOT_READ_IN_TIME,
+    REST_READ_S,
+    REST_S,
+    LateReport,
+    StallDetector,
+    more_may_wait,
+)
 from drivers.stations.config import StationConfig
 from drivers.stations.poller import Poller
 from drivers.stations.serial_port import SerialPort
@@ -84,11 +91,14 @@ class StationLink:
         self, port: SerialPort, emit: Emit, stop: threading.Event, late: LateReport, stalls: StallDetector
     ) -> None:
         poller = start_poller(self._config)
-        is_last = False
-        while not is_last:
-            is_last = stop.is_set()  # what has come by then is still read
-            wait_s = 0.0 if is_last else _LONGEST_READ_S if poller is None else self._send_due(port, poller, emit)
-            timeout_s = self._clock.real_seconds(wait_s)
+        rest: TimeBudget | None = None
+        is_emptied = False
+        while rest is None or not (is_emptied or rest.is_over):
+            if stop.is_set():  # what has come by then is still read
+                rest, timeout_s = rest or TimeBudget(REST_S), REST_READ_S
+            else:
+                wait_s = _LONGEST_READ_S if poller is None else self._send_due(port, poller, emit)
+                timeout_s = self._clock.real_seconds(wait_s)
             began = self._clock.now()
             data = port.read(timeout_s)
             self._last_read = stamp = self._clock.now()
@@ -103,7 +113,8 @@ class StationLink:
                 emit(capture)
                 if poller is not None:
                     poller.feed(capture)
-            if not is_late:
+            is_emptied = not more_may_wait(data)
+            if is_emptied and not is_late:
                 self.read_until = began
         if poller is not None:
             for command in poller.closing():

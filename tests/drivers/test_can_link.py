@@ -564,14 +564,14 @@ def test_a_scaled_clock_is_not_mixed_with_the_kernel_s_time() -> None:
 # What stays true whatever is plugged in
 
 
-def test_what_waits_to_be_read_when_a_link_is_to_stop_is_still_read() -> None:
+def test_what_waits_to_be_read_when_a_link_is_to_stop_is_still_read_and_nothing_more_is_sent() -> None:
     channel = unused_channel()
     heard, stop, go_on = Heard(), threading.Event(), threading.Event()
-    link = virtual_link(channel)
+    link = virtual_link(channel, allow_transmit=True, sync_period_ms=1.0)
 
     def emit(item: CanCapture | DeviceEvent | Gap) -> None:
         heard(item)
-        if isinstance(item, CanCapture):
+        if isinstance(item, CanCapture) and not item.is_transmitted:
             go_on.wait(DEADLINE_S)
 
     with virtual_bus(channel) as bus:
@@ -583,10 +583,32 @@ def test_what_waits_to_be_read_when_a_link_is_to_stop_is_still_read() -> None:
         for _ in range(2 * BATCH_MAX):
             bus.send(message("1A0 01"))
         stop.set()
+        was_sent = {capture.stamp for capture in heard.sent}
+        now = SystemClock().now()
         go_on.set()
         thread.join(DEADLINE_S)
     assert not thread.is_alive()
     assert len(heard.received) == 1 + 2 * BATCH_MAX
+    late = [capture for capture in heard.sent if capture.stamp not in was_sent]  # sent before, and told after
+    assert all(capture.stamp.since(now) < 0 for capture in late)
+
+
+def test_frames_from_before_the_bus_was_open_are_not_sent() -> None:
+    """What a machine would take for the present is minutes old."""
+    channel = unused_channel()
+    link = virtual_link(channel, allow_transmit=True, own_identifiers=(0x6A0,))
+    heard, stop = Heard(), threading.Event()
+    link.publish([Frame(0x6A0, b"old")])
+    with virtual_bus(channel) as bus:
+        thread = threading.Thread(target=link.run, args=(heard, stop))
+        thread.start()
+        heard.wait_for(EventKind.LINK_UP)
+        link.publish([Frame(0x6A0, b"new")])
+        received = bus.recv(DEADLINE_S)
+        stop.set()
+        thread.join(DEADLINE_S)
+    assert received is not None
+    assert received.data == b"new"
 
 
 def test_a_link_stops_soon_and_its_last_words_are_kept() -> None:

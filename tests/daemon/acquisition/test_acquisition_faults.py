@@ -113,6 +113,48 @@ def test_a_disk_that_stays_full_does_not_keep_the_daemon_from_stopping(
     assert not acquisition.alive(within_s=DEADLINE_S)
 
 
+def test_a_disk_that_has_room_again_while_the_daemon_stops_takes_all_that_waits(
+    path: Path, store: Store, acquire: Make
+) -> None:
+    gate = threading.Event()
+    link = ListLink("boom", [frame(n) for n in range(3000)], gate)
+    acquisition = acquire([link])
+    acquisition.start()
+    fill_up(store)
+    gate.set()
+    wait_until(lambda: acquisition.status().error is not None)
+    room = threading.Timer(0.5, make_room, [store])
+    room.start()
+    acquisition.stop()
+    room.join()
+    assert acquisition.has_stored_all
+    assert [int.from_bytes(capture.data, "little") for capture in raw(path)] == list(range(3000))
+
+
+def test_only_captures_are_counted_as_given_up(
+    store: Store, acquire: Make, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Those that found the queue full too; what else a link tells late does not make the end of a run unclean."""
+    monkeypatch.setattr(acquisition_module, "LINKS_STOP_S", 0.05)
+    release = threading.Event()
+
+    class Late(ListLink):
+        def run(self, emit: Callable[[LinkItem], None], stop: threading.Event) -> None:
+            release.wait(DEADLINE_S)
+            super().run(emit, stop)
+
+    event = DeviceEvent("boom", at(9), EventKind.WARNING, "late")
+    late = Late("boom", [event])
+    acquisition = acquire([late])
+    acquisition.start()
+    intake = acquisition._intakes[0]
+    acquisition.stop()
+    release.set()
+    wait_until(late.done.is_set)
+    assert (intake.queued, intake.unstored) == (1, 0)
+    assert acquisition.has_stored_all
+
+
 # ---- the faults of its parts -----------------------------------------------------------------------------------------
 
 

@@ -15,6 +15,7 @@ from daemon.acquisition.link_intake import LinkIntake
 from daemon.store import Store
 from drivers.clock import SystemClock
 from drivers.readings import CanCapture, DeviceEvent, EventKind, Gap, GapReason, LinkItem
+from simulators.replay import ReplayLink
 from tests.daemon.acquisition_support import DEADLINE_S, ListLink, wait_until
 
 
@@ -96,7 +97,7 @@ def test_a_link_that_is_not_read_for_long_has_a_gap_of_its_own(monkeypatch: pyte
     """Its loop hangs, as it opens the port or later. What the others captured meanwhile is in no doubt."""
     monkeypatch.setattr(link_intake, "LEFT_BEHIND_S", 0.0)
     clock = SystemClock()
-    begun = clock.now().shifted(-2_000_000_000)
+    begun = clock.now().shifted(-9_000_000_000)
     read = opened = begun.shifted(1_000_000_000)
     up = DeviceEvent("boom", opened, EventKind.LINK_UP, "open")
     gate, stop = threading.Event(), threading.Event()
@@ -119,5 +120,20 @@ def test_a_link_that_is_not_read_for_long_has_a_gap_of_its_own(monkeypatch: pyte
         gate.set()
         wait_until(loop.done.is_set)
         assert intake.drain() == [Gap("boom", GapReason.LINK_DOWN, since, opened), up]
+    stop.set()
+    intake.join(DEADLINE_S)
+
+
+def test_a_log_that_begins_late_is_no_link_that_is_down(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(link_intake, "LEFT_BEHIND_S", 0.0)
+    clock = SystemClock()
+    begun = clock.now().shifted(-60_000_000_000)
+    late = CanCapture("boom", clock.now().shifted(200_000_000), 1, b"")
+    replay, stop = ReplayLink("boom", [late], clock), threading.Event()
+    intake = LinkIntake(replay, clock, 100, begun)
+    intake.start(stop)
+    assert intake.drain() == []
+    wait_until(replay.is_finished.is_set)
+    assert intake.drain() == [late]
     stop.set()
     intake.join(DEADLINE_S)

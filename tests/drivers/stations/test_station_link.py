@@ -96,6 +96,30 @@ def test_a_port_counts_as_read_up_to_its_last_read_and_not_while_it_is_gone(tmp_
             thread.join(DEADLINE_S)
 
 
+def test_all_that_a_terminal_holds_is_read_before_a_link_stops(tmp_path: Path) -> None:
+    """A read of a terminal returns 4 KiB at most, however much waits."""
+    collected, stop, go_on = Collected(), threading.Event(), threading.Event()
+
+    def emit(item: LinkItem) -> None:
+        collected.emit(item)
+        if isinstance(item, SerialCapture) and not item.is_transmitted:
+            go_on.wait(DEADLINE_S)
+
+    with plugged_in(tmp_path / "tty") as instrument:
+        link = StationLink(config(instrument.path), SystemClock())
+        thread = threading.Thread(target=link.run, args=(emit, stop))
+        thread.start()
+        collected.wait_for_event(EventKind.LINK_UP)
+        sent = [b"%06d\r\n" % number for number in range(1500)]
+        instrument.send(sent[0])
+        collected.wait_for_bytes(len(sent[0]))
+        instrument.send(b"".join(sent[1:]))
+        stop.set()
+        go_on.set()
+        thread.join(DEADLINE_S)
+    assert collected.received_bytes() == b"".join(sent)
+
+
 def test_the_link_survives_unplugging_and_plugging_in_again(tmp_path: Path) -> None:
     with plugged_in(tmp_path / "tty") as instrument, running(config(instrument.path)) as collected:
         track(instrument)
