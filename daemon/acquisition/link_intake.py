@@ -123,12 +123,11 @@ class LinkIntake:
             if behind is not None and since != behind:
                 self._behind = None
                 return [Gap(self.name, GapReason.LINK_DOWN, behind, since or now)]
-            until = self._loop.read_until
-            is_reading = (
-                since is not None and until is not None and until.since(since) > 0
-            )  # as a log is, from the start
-            if since is None or behind is not None or is_reading:
+            if since is None or behind is not None:
                 return []
+            until = self._loop.read_until
+            if until is not None and until.since(since) > 0:
+                return []  # it is read, and its first word is to come, which a log may say late
             waited_ns = now.since(since)
             if waited_ns < _LEFT_BEHIND_NS or self._clock.real_seconds(waited_ns / NS_PER_S) < LEFT_BEHIND_S:
                 return []
