@@ -1,6 +1,7 @@
 """The live tip as CAN frames: what is sent, what a receiver makes of it, and what may not be sent."""
 
 import math
+import threading
 from pathlib import Path
 
 import can
@@ -14,8 +15,8 @@ from drivers.can.frame import Frame
 from drivers.can.tip_frames import TipMessage, TipStatus, encode_tip
 from drivers.canopen.transmit import FREE_IDENTIFIERS, TransmitPermission
 from drivers.errors import TransmitForbiddenError
-from drivers.readings import EventKind
-from tests.drivers.can_support import running, unused_channel, virtual_bus, virtual_link
+from drivers.readings import CanCapture, DeviceEvent, EventKind, Gap
+from tests.drivers.can_support import DEADLINE_S, Heard, unused_channel, virtual_bus, virtual_link
 
 DBC = cantools.database.load_file(Path(drivers.can.__file__).with_name("tip.dbc"), database_format="dbc")
 IDENTIFIER = 0x680
@@ -117,14 +118,23 @@ def test_identifiers_that_canopen_needs_are_none_of_its_own(identifier: int) -> 
 def test_a_link_publishes_the_newest_frames_on_the_bus_and_captures_them_as_sent() -> None:
     channel = unused_channel()
     link = virtual_link(channel, allow_transmit=True, own_identifiers=(0x680, 0x681))
-    for number in range(3):  # before the bus is open: only the newest is left
-        link.publish(encode_tip(TipMessage(TipStatus.NO_MODEL), 0x680, number))
-    with virtual_bus(channel) as bus, running(link) as heard:
-        heard.wait_for(EventKind.LINK_UP)
+    heard, stop = Heard(), threading.Event()
+
+    def emit(item: CanCapture | DeviceEvent | Gap) -> None:
+        heard(item)
+        if isinstance(item, DeviceEvent) and item.kind is EventKind.LINK_UP:
+            for number in range(3):  # before the link sends any of them: only the newest is left
+                link.publish(encode_tip(TipMessage(TipStatus.NO_MODEL), 0x680, number))
+
+    thread = threading.Thread(target=link.run, args=(emit, stop))
+    with virtual_bus(channel) as bus:
+        thread.start()
         heard.wait(lambda: len(heard.sent) == 2, "two frames")
         received: list[can.Message] = [m for m in (bus.recv(1.0), bus.recv(1.0)) if m is not None]
         assert [(m.arbitration_id, m.data[6]) for m in received] == [(0x680, 2), (0x681, 2)]
         assert bus.recv(0.0) is None
+        stop.set()
+        thread.join(DEADLINE_S)
 
 
 def test_a_link_publishes_nothing_that_it_was_not_configured_for() -> None:
