@@ -74,18 +74,24 @@ def test_what_a_full_queue_drops_is_counted_and_recorded(path: Path, acquire: Ma
     assert (gap["start_utc_ns"], gap["end_utc_ns"]) == (frame(100).stamp.utc_ns, frame(999).stamp.utc_ns)
 
 
-def test_a_full_disk_is_told_and_waited_for_and_nothing_is_lost(
-    path: Path, store: Store, acquire: Make, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(acquisition_module, "RETRY_S", 0.02)
+def on_a_full_disk(acquire: Make, store: Store, frames: Sequence[LinkItem]) -> tuple[Acquisition, ListLink]:
+    """Acquisition whose disk is full since before its link emits `frames`, and that has noticed it."""
     gate = threading.Event()
-    frames = [frame(n) for n in range(3000)]
     link = ListLink("boom", frames, gate)
     acquisition = acquire([link])
     acquisition.start()
     fill_up(store)
     gate.set()
     wait_until(lambda: acquisition.status().error is not None)
+    return acquisition, link
+
+
+def test_a_full_disk_is_told_and_waited_for_and_nothing_is_lost(
+    path: Path, store: Store, acquire: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(acquisition_module, "RETRY_S", 0.02)
+    frames = [frame(n) for n in range(3000)]
+    acquisition, link = on_a_full_disk(acquire, store, frames)
     assert "full" in str(acquisition.status().error)
     assert acquisition.alive(within_s=DEADLINE_S)
     wait_until(link.done.is_set)
@@ -99,13 +105,7 @@ def test_a_full_disk_is_told_and_waited_for_and_nothing_is_lost(
 def test_a_disk_that_stays_full_does_not_keep_the_daemon_from_stopping(
     store: Store, acquire: Make, caplog: pytest.LogCaptureFixture
 ) -> None:
-    gate = threading.Event()
-    link = ListLink("boom", [frame(n) for n in range(3000)], gate)
-    acquisition = acquire([link])
-    acquisition.start()
-    fill_up(store)
-    gate.set()
-    wait_until(lambda: acquisition.status().error is not None)
+    acquisition, _ = on_a_full_disk(acquire, store, [frame(n) for n in range(3000)])
     with caplog.at_level(logging.CRITICAL):
         acquisition.stop()
     assert "nothing is stored any more: " in caplog.text
@@ -116,13 +116,7 @@ def test_a_disk_that_stays_full_does_not_keep_the_daemon_from_stopping(
 def test_a_disk_that_has_room_again_while_the_daemon_stops_takes_all_that_waits(
     path: Path, store: Store, acquire: Make
 ) -> None:
-    gate = threading.Event()
-    link = ListLink("boom", [frame(n) for n in range(3000)], gate)
-    acquisition = acquire([link])
-    acquisition.start()
-    fill_up(store)
-    gate.set()
-    wait_until(lambda: acquisition.status().error is not None)
+    acquisition, _ = on_a_full_disk(acquire, store, [frame(n) for n in range(3000)])
     room = threading.Timer(0.5, make_room, [store])
     room.start()
     acquisition.stop()
@@ -131,9 +125,7 @@ def test_a_disk_that_has_room_again_while_the_daemon_stops_takes_all_that_waits(
     assert [int.from_bytes(capture.data, "little") for capture in raw(path)] == list(range(3000))
 
 
-def test_only_captures_are_counted_as_given_up(
-    store: Store, acquire: Make, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_only_captures_are_counted_as_given_up(acquire: Make, monkeypatch: pytest.MonkeyPatch) -> None:
     """Those that found the queue full too; what else a link tells late does not make the end of a run unclean."""
     monkeypatch.setattr(acquisition_module, "LINKS_STOP_S", 0.05)
     release = threading.Event()
@@ -144,14 +136,16 @@ def test_only_captures_are_counted_as_given_up(
             super().run(emit, stop)
 
     event = DeviceEvent("boom", at(9), EventKind.WARNING, "late")
-    late = Late("boom", [event])
-    acquisition = acquire([late])
+    late, full = Late("boom", [event]), Late("aux", [frame(n, link="aux") for n in range(5)])
+    acquisition = acquire([late, full], queue_captures=3)
     acquisition.start()
-    intake = acquisition._intakes[0]
+    of_event, of_frames = acquisition._intakes
     acquisition.stop()
     release.set()
-    wait_until(late.done.is_set)
-    assert (intake.queued, intake.unstored) == (1, 0)
+    for link in (late, full):
+        wait_until(link.done.is_set)
+    assert (of_event.queued, of_event.unstored) == (1, 0)
+    assert (of_frames.queued, of_frames.unstored) == (3, 5)
     assert acquisition.has_stored_all
 
 

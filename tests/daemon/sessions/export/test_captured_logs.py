@@ -44,6 +44,23 @@ def heard(*, is_silent: bool) -> list[int]:
     return [*range(1, until), *range(REBOOT_S + 1, END_S)]
 
 
+def with_a_session(path: Path) -> Rig:
+    """A rig whose session `s1` has begun."""
+    rig = Rig(path)
+    rig.clock.set(BEGIN)
+    rig.store.begin_run(BEGIN)
+    rig.say("setup_new", id="S1")
+    rig.say("start", prism="r", id="s1")
+    return rig
+
+
+def close(rig: Rig) -> None:
+    """End its session, its run and its store."""
+    rig.say("stop")
+    rig.store.end_run(rig.clock.now())
+    rig.store.close()
+
+
 @pytest.mark.parametrize("can_format", ["log", "asc", "blf"])
 @pytest.mark.parametrize("behind_s", [0, 3600])
 @pytest.mark.parametrize("silent", ["boom", "ts"])
@@ -52,11 +69,7 @@ def test_a_link_that_fell_silent_before_a_reboot_comes_beside_the_others_of_the_
 ) -> None:
     boom, ts = (heard(is_silent=silent == link) for link in ("boom", "ts"))
     config = parse_config(CONFIG, tmp_path / "rigcal.toml")
-    rig = Rig(config.store_path)
-    rig.clock.set(BEGIN)
-    rig.store.begin_run(BEGIN)
-    rig.say("setup_new", id="S1")
-    rig.say("start", prism="r", id="s1")
+    rig = with_a_session(config.store_path)
     for seconds in (range(1, REBOOT_S - 9), range(REBOOT_S + 1, END_S)):
         stamps = {second: at_second(second, behind_s) for second in seconds}
         rig.clock.set(stamps[seconds[0]])
@@ -65,9 +78,7 @@ def test_a_link_that_fell_silent_before_a_reboot_comes_beside_the_others_of_the_
         lines = [SerialCapture("ts", at, b"%d\r\n" % n) for n, at in stamps.items() if n in ts]
         rig.store.mark_decoded([*rig.store.append_captures(frames), *rig.store.append_captures(lines)])
     rig.clock.set(at_second(END_S, behind_s))
-    rig.say("stop")
-    rig.store.end_run(rig.clock.now())
-    rig.store.close()
+    close(rig)
     logs = [path for path in export_session(config, "s1", tmp_path / "out", can_format) if path.suffix != ".csv"]
     told = read_session_file(logs.pop())
     came: dict[str, list[int]] = {"boom": [], "ts": []}
@@ -83,19 +94,13 @@ def test_a_link_that_fell_silent_before_a_reboot_comes_beside_the_others_of_the_
 
 def test_a_damaged_store_leaves_no_part_of_a_session_s_logs(tmp_path: Path) -> None:
     config = parse_config(CONFIG, tmp_path / "rigcal.toml")
-    rig = Rig(config.store_path)
-    rig.clock.set(BEGIN)
-    rig.store.begin_run(BEGIN)
-    rig.say("setup_new", id="S1")
-    rig.say("start", prism="r", id="s1")
+    rig = with_a_session(config.store_path)
     for second in (1, 2):
         (chunk,) = rig.store.append_captures([CanCapture("boom", at_second(second, 0), 0x1A0, bytes([second]))])
         rig.store.mark_decoded([chunk])
     rig.clock.set(at_second(3, 0))
-    rig.say("stop")
     rig.store.update("raw_chunks", {"id": chunk}, {"chunk": b"rust"})
-    rig.store.end_run(rig.clock.now())
-    rig.store.close()
+    close(rig)
     with pytest.raises(StoreError, match=f"raw chunk {chunk}"):
         export_session(config, "s1", tmp_path / "out", "log")
     assert [*(tmp_path / "out").iterdir()] == []
