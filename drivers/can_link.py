@@ -15,19 +15,13 @@ from drivers.can.stamps import ReceiveStamps
 from drivers.canopen.node_setup import NodeSetup, SetupRunner
 from drivers.canopen.sync import SyncProducer
 from drivers.canopen.transmit import TransmitPermission
-from drivers.clock import NS_PER_S, Clock, Stamp, TimeBudget
+from drivers.clock import NS_PER_S, Clock, Stamp
 from drivers.device_watch import DeviceWatch, no_watch, watch_interface, watch_path
 from drivers.errors import DeviceError, LinkError
+from drivers.last_reads import LAST_READ_S, LastReads
 from drivers.outage import Backoff, Outage
 from drivers.readings import CanCapture, Capture, DeviceEvent, EventKind, Gap, GapReason
-from drivers.stall_detector import (
-    CLOCK_WAS_SET,
-    NOT_READ_IN_TIME,
-    REST_READ_S,
-    REST_S,
-    LateReport,
-    StallDetector,
-)
+from drivers.stall_detector import CLOCK_WAS_SET, NOT_READ_IN_TIME, LateReport, StallDetector
 
 POLL_S = 0.05  # how long a stop or a set-up request may go unnoticed
 LOSS_CHECK_NS = NS_PER_S
@@ -58,9 +52,9 @@ class CanLink:
         configure_at_start: bool = False,
     ) -> None:
         self.name = config.name
-        self.read_until: Stamp | None = None
         self._config = config
         self._clock = clock
+        self._session: _Session | None = None  # the last one; none once its bus is lost
         self._permission = TransmitPermission(
             config.name, config.allow_transmit, config.transmit_nodes, config.own_identifiers
         )
@@ -76,6 +70,10 @@ class CanLink:
         self._at_start: list[NodeSetup] = []
         if configure_at_start and self._setups:
             self._at_start = self._permitted(self._setups)
+
+    @property
+    def read_until(self) -> Stamp | None:
+        return None if self._session is None else self._session.read_until
 
     @property
     def has_setups(self) -> bool:
@@ -140,7 +138,7 @@ class CanLink:
     def run(self, emit: Emit, stop: threading.Event) -> None:
         """Receive until `stop` is set, opening the bus again whenever it is lost.
 
-        What waits to be read by then is read for `REST_S` at most, and nothing more is sent.
+        What waits to be read by then is still read (`LastReads`), and nothing more is sent.
         """
         backoff = Backoff()
         outage = Outage(self.name, emit)
@@ -151,7 +149,7 @@ class CanLink:
                     self._serve(emit, stop, outage, backoff, watch)
                 except LinkError as error:
                     outage.begin(str(error), self._clock.now(), self._last_frame)
-                    self.read_until = None
+                    self._session = None
                     wait_s = backoff.next_s()
                     # Of real seconds, for devices are plugged in by people; fewer where time is made to run faster
                     watch.wait(stop, min(wait_s, self._clock.real_seconds(wait_s)))
@@ -167,26 +165,25 @@ class CanLink:
             at_start, self._at_start = self._at_start, []
             self._swap_requests(at_start)
             self._published.clear()
-            rest: TimeBudget | None = None
+            last_reads = LastReads(stop)
             try:
-                self.read_until = session.read_until
+                self._session = session
                 outage.end(self._clock.now(), f"{self.name}: the bus is open")
                 while True:
                     session.take(read)
                     if read.batch.received:
                         backoff.reset()
-                    if rest is not None and (read.batch.is_last or rest.is_over):
+                    if last_reads.are_over(is_emptied=read.batch.is_last):
                         return
-                    if stop.is_set():
-                        rest = rest or TimeBudget(REST_S)
+                    if last_reads.have_begun():
+                        read = session.read(LAST_READ_S)
                     else:
                         session.serve(self._swap_requests([]), self._take_published())
-                        self.read_until = session.read_until
-                    read = session.read(REST_READ_S if rest else session.patience_s())
+                        read = session.read(session.patience_s())
             finally:
                 cause = "rigcal was stopped" if stop.is_set() else "the link was lost"
                 session.close(self._swap_requests(None), cause)
-                self._last_frame, self.read_until = session.last_frame, session.read_until
+                self._last_frame = session.last_frame
 
     def _swap_requests(self, requests: list[NodeSetup] | None) -> list[NodeSetup]:
         """Return the set-ups that were asked for, and put `requests` in their place."""
@@ -278,8 +275,8 @@ class _Session:
         stamps = self._stamps.of(read.batch, read.began, read.ended, is_late=is_late)
         name, emit, sent, doubtful = self._name, self._emit, self._sent, 0
         for (frame, _), stamp in zip(read.batch.received, stamps, strict=True):
-            while sent and sent[0].stamp.monotonic_ns <= stamp.monotonic_ns:
-                emit(sent.popleft())
+            if sent:
+                self._emit_sent(stamp)
             doubtful += stamp.is_doubtful
             arbitration_id, data, is_extended, is_remote, is_error = frame
             emit(CanCapture(name, stamp, arbitration_id, data, is_extended, is_remote, is_error))

@@ -1,4 +1,4 @@
-"""Detection of stalls of a link's loop: what was not read in time has no time of its own. And of what still waits."""
+"""Detection of stalls of a link's loop: what was not read in time has no time of its own."""
 
 from __future__ import annotations
 
@@ -8,18 +8,7 @@ from drivers.readings import DeviceEvent, EventKind, Gap, GapReason
 LATE_S = 0.25  # what is read later than this is marked as of doubtful time, where nothing says when it came
 NOT_READ_IN_TIME = "nobody read for a while: rigcal was stopped, or the computer too busy"
 CLOCK_WAS_SET = "the computer's clock was set at that time"
-REST_S = 2.0  # real seconds at most for which a link that is to stop reads what still waits
-REST_READ_S = 0.02  # real seconds for each of these reads
 _REPORT_NS = NS_PER_S
-_FULL_TTY_BYTES = 3072
-
-
-def more_may_wait(data: bytes) -> bool:
-    """Return True if a read of a terminal returned so much that more may wait.
-
-    Linux keeps 4 KiB ready, and moves up what waits behind it, 64 KiB and more, only after a read has made room.
-    """
-    return len(data) >= _FULL_TTY_BYTES
 
 
 class StallDetector:

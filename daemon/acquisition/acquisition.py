@@ -201,19 +201,16 @@ class Acquisition:
             while not self._finish.is_set():
                 now = self._clock.now()
                 self._last_cycle_ns = now.monotonic_ns
-                read_until = self._read_until(now)
-                self._take_in()
+                read_until = self._take_in(now)
                 if now.monotonic_ns >= next_alive_ns:
-                    self._try("its sign of life", partial(self._store.note_alive, read_until))
+                    self._note_alive(read_until)
                     next_alive_ns = now.monotonic_ns + ALIVE_NS
                 is_done = self._decode_next(now)
                 if not is_done:
                     self._finish.wait(RETRY_S)
                 elif self._backlog.is_empty:
                     self._finish.wait(self._batch_seconds)
-            read_until = self._read_until(self._clock.now())
-            self._take_in()
-            self._try("its sign of life", partial(self._store.note_alive, read_until))
+            self._note_alive(self._take_in(self._clock.now()))
             while not self._decode_until.is_over and not (self._backlog.is_empty and self._decoded is None):
                 if not self._decode_next(self._clock.now()):
                     break
@@ -223,19 +220,23 @@ class Acquisition:
             self._board.set_error(f"the writer failed: {error}; restart rigcal")
             self._failure = error
 
-    def _read_until(self, now: Stamp) -> Stamp:
-        """Return until when all that the links received is queued; asked before the queues are drained."""
-        links = [intake.read_until for intake in self._intakes]
-        return min([now, *filter(None, links)], key=lambda stamp: stamp.monotonic_ns)
+    def _note_alive(self, read_until: Stamp) -> None:
+        self._try("its sign of life", partial(self._store.note_alive, read_until))
 
-    def _take_in(self) -> None:
-        """Commit what the links have captured, however long the disk is full or faulty; meanwhile captures queue."""
+    def _take_in(self, now: Stamp) -> Stamp:
+        """Commit what the links have captured, however long the disk is full or faulty; meanwhile captures queue.
+
+        Returns:
+            Until when all that their ports received is committed, or its loss is.
+        """
+        links = [intake.read_until for intake in self._intakes]  # asked before the queues are drained
+        read_until = min([now, *filter(None, links)], key=lambda stamp: stamp.monotonic_ns)
         queues = [intake.drain() for intake in self._intakes]
         if self._clock_watch is not None and (step := self._clock_watch.look(self._clock.now())) is not None:
             queues.append([step])
         items = [item for queue in queues for item in queue]
         if not items:
-            return
+            return read_until
         if len(items) > BATCH_CAPTURES:
             items = _in_time_order(queues)
         self._unstored = sum(isinstance(item, CanCapture | SerialCapture) for item in items)
@@ -245,6 +246,7 @@ class Acquisition:
             self._board.captured(batch.captures)
             self._backlog.add(batch)
             _tell_of_links(batch.reports)
+        return read_until
 
     def _decode_next(self, now: Stamp) -> bool:
         """Decode one batch and the time that has passed, if that is all, and store what comes of it.

@@ -14,6 +14,8 @@ from daemon.cli.command import json_option
 from daemon.commands import INSTALLED_CONFIG, INSTALLED_SOCKET
 from daemon.control.protocol import request
 
+STATUS_TIMEOUT_S = 10.0  # a daemon that says nothing for so long is not well
+
 operator_option = click.option(
     "--operator", default=lambda: os.environ.get("USER", ""), help="Who is responsible; kept with the decision."
 )

@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import logging
 import os
+import shutil
 import sys
+import textwrap
 import unicodedata
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -19,9 +21,11 @@ from daemon.host.safe_output import shown, shown_lines
 from daemon.host.systemd import is_journal, priority_prefix
 
 _LISTED = 10
+_LEAST_WRAPPED = 30  # columns for the words of a table's last column
 _MOST_SHOWN = 0.99  # of work that goes on: it is not at its end
 # xterm's sequences: another screen without a cursor, its first place, and back to the terminal as it was.
 _BEGIN, _HOME, _END = "\x1b[?1049h\x1b[?25l", "\x1b[H", "\x1b[?25h\x1b[?1049l"
+_BETWEEN = "  "  # the columns of a table
 _REST_OF_LINE, _REST_OF_SCREEN = "\x1b[K", "\x1b[J"
 
 
@@ -94,7 +98,7 @@ def echo_table(
     text_columns: Sequence[int] | None = None,
     bold: Sequence[bool] = (),
 ) -> None:
-    """Print a table. On a narrow terminal its lines wrap: no number is cut short.
+    """Print a table, in which nothing is cut short: where a terminal is narrow, the words of the last column wrap.
 
     Args:
         header: a heading for each column.
@@ -106,24 +110,31 @@ def echo_table(
     cells = [[cell if isinstance(cell, Coloured) else Coloured(cell, "") for cell in row] for row in rows]
     texts = [[shown(name) for name in header], *([shown(cell.text) for cell in row] for row in cells)]
     widths = [max(map(_width, column)) for column in zip(*texts, strict=True)]
+    is_left = [text_columns is None or column in text_columns for column in range(len(header))]
+    before = sum(widths[:-1]) + len(_BETWEEN) * (len(widths) - 1)
+    room = shutil.get_terminal_size((0, 0)).columns - before
+    widths[-1] = min(widths[-1], room) if is_left[-1] and room >= _LEAST_WRAPPED else widths[-1]
 
     def padded(column: int, text: str) -> str:
         space = " " * (widths[column] - _width(text))
-        return text + space if text_columns is None or column in text_columns else space + text
+        return text + space if is_left[column] else space + text
 
     if title:
         echo(title, bold=True)
-    echo("  ".join(padded(i, text) for i, text in enumerate(texts[0])).rstrip())
-    echo("  ".join("\N{BOX DRAWINGS LIGHT HORIZONTAL}" * width for width in widths))
+    echo(_BETWEEN.join(padded(i, text) for i, text in enumerate(texts[0])).rstrip())
+    echo(_BETWEEN.join("\N{BOX DRAWINGS LIGHT HORIZONTAL}" * width for width in widths))
     for number, (row, line) in enumerate(zip(cells, texts[1:], strict=True)):
         is_bold = bool(bold) and bold[number]
+        first, *further = _lines(line[-1], widths[-1])
         styled = [
             click.style(padded(i, text), fg=cell.colour or None, bold=is_bold or None)
             if cell.colour or is_bold
             else padded(i, text)
-            for i, (cell, text) in enumerate(zip(row, line, strict=True))
+            for i, (cell, text) in enumerate(zip(row, [*line[:-1], first], strict=True))
         ]
-        click.echo("  ".join(styled).rstrip(), color=_color())
+        click.echo(_BETWEEN.join(styled).rstrip(), color=_color())
+        for text in further:
+            echo(" " * before + text)
 
 
 def counted(count: int, noun: str) -> str:
@@ -136,6 +147,13 @@ def percent(share: float) -> str:
     return f"{min(share, _MOST_SHOWN):.0%}".replace("%", " %")
 
 
+def _lines(text: str, width: int) -> list[str]:
+    """Return a text in lines of so many columns; a word that is longer, as a path may be, is not broken."""
+    if _width(text) <= width:
+        return [text]
+    return textwrap.wrap(text, width, break_long_words=False, break_on_hyphens=False)
+
+
 def _width(text: str) -> int:
     """Return the number of columns that a terminal gives to a text."""
     if text.isascii():
@@ -145,5 +163,5 @@ def _width(text: str) -> int:
 
 
 def _color() -> bool | None:
-    """Return click's `color`: none where NO_COLOR is set, else as the terminal can (https://no-color.org)."""
-    return False if os.environ.get("NO_COLOR") else None
+    """Return click's `color`: none where NO_COLOR is set (https://no-color.org) or the terminal has none."""
+    return False if os.environ.get("NO_COLOR") or os.environ.get("TERM") == "dumb" else None

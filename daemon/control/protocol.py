@@ -145,7 +145,11 @@ def request(path: Path, command: str, arguments: Mapping[str, Any] | None = None
         except PermissionError:
             line = _exchange_reading(path, message, timeout_s)
     except TimeoutError:
-        raise CommandError(f"the daemon at {path} did not answer within {timeout_s:g} s", FAILED) from None
+        raise CommandError(
+            f"the daemon at {path} did not answer within {timeout_s:g} s: it hangs, is stopped by a signal, or the "
+            "computer is too busy; see its log",
+            FAILED,
+        ) from None
     except OSError as error:
         raise unreachable(path, error) from None
     return result_of(line, path)

@@ -179,7 +179,10 @@ def _words(job: Job, kind: str, around: Around) -> tuple[str, str]:
             "Fixes count from then on, as fixes of this prism."
             + (" They are kept apart to judge the model." if run.kind == CHECK else ""),
         ),
-        "planning": ("Wait; this takes a second or two.", "The poses follow from what is known by now."),
+        "planning": (
+            "Wait; this takes a few seconds, the first time up to half a minute.",
+            "The poses follow from what is known by now.",
+        ),
         "go_to_pose": (
             "Move every joint to its target; the pose is measured by itself once the boom stands.",
             "The check shows how far off the model is at poses it has never seen."

@@ -33,7 +33,7 @@ from can.interfaces.virtual import VirtualBus
 from drivers.can.frame import DATA_MAX, Frame, SlcanLines, parse_can_frame, parse_multicast
 from drivers.clock import NS_PER_S
 from drivers.errors import LinkError
-from drivers.stall_detector import more_may_wait
+from drivers.last_reads import more_may_wait
 
 Interface = Literal["socketcan", "virtual", "udp_multicast", "slcan"]
 

@@ -6,19 +6,13 @@ import threading
 from collections.abc import Callable
 from contextlib import closing
 
-from drivers.clock import NS_PER_S, Clock, Stamp, TimeBudget
+from drivers.clock import NS_PER_S, Clock, Stamp
 from drivers.device_watch import watch_path
 from drivers.errors import LinkError
+from drivers.last_reads import LAST_READ_S, LastReads, more_may_wait
 from drivers.outage import BACKOFF_MAX_S, Backoff, Outage
 from drivers.readings import DeviceEvent, LinkItem, SerialCapture
-from drivers.stall_detector import (
-    NOT_READ_IN_TIME,
-    REST_READ_S,
-    REST_S,
-    LateReport,
-    StallDetector,
-    more_may_wait,
-)
+from drivers.stall_detector import NOT_READ_IN_TIME, LateReport, StallDetector
 from drivers.stations.config import StationConfig
 from drivers.stations.poller import Poller
 from drivers.stations.serial_port import SerialPort
@@ -91,11 +85,10 @@ class StationLink:
         self, port: SerialPort, emit: Emit, stop: threading.Event, late: LateReport, stalls: StallDetector
     ) -> None:
         poller = start_poller(self._config)
-        rest: TimeBudget | None = None
-        is_emptied = False
-        while rest is None or not (is_emptied or rest.is_over):
-            if stop.is_set():  # what has come by then is still read
-                rest, timeout_s = rest or TimeBudget(REST_S), REST_READ_S
+        last_reads, is_emptied = LastReads(stop), False
+        while not last_reads.are_over(is_emptied=is_emptied):
+            if last_reads.have_begun():
+                timeout_s = LAST_READ_S
             else:
                 wait_s = _LONGEST_READ_S if poller is None else self._send_due(port, poller, emit)
                 timeout_s = self._clock.real_seconds(wait_s)

@@ -10,7 +10,7 @@ from pathlib import Path
 import click
 
 from daemon.cli import diagnosis
-from daemon.cli.client import client_options, socket_of
+from daemon.cli.client import STATUS_TIMEOUT_S, client_options, socket_of
 from daemon.cli.command import DONE, FAILED, Command, Delivered
 from daemon.cli.diagnosis import Finding
 from daemon.cli.terminal import echo
@@ -18,7 +18,6 @@ from daemon.commands import INSTALLED_CONFIG, CommandError
 from daemon.control.protocol import request
 from daemon.version import VERSION
 
-TIMEOUT_S = 10.0
 _COLOURS = {"good": "green", "warning": "yellow", "fault": "red", "unknown": None}
 
 
@@ -50,7 +49,7 @@ def _examine(socket: Path | None, path: Path | None) -> Iterator[Finding]:
     yield from diagnosis.computer(config)
     at = socket_of(socket, None) if config is None or socket is not None else config.socket_path
     try:
-        status = request(at, "status", timeout_s=TIMEOUT_S)
+        status = request(at, "status", timeout_s=STATUS_TIMEOUT_S)
     except CommandError as error:
         if config is not None:
             yield from diagnosis.devices(config)

@@ -12,7 +12,7 @@ from typing import Any
 
 import click
 
-from daemon.cli.client import client_options, socket_of
+from daemon.cli.client import STATUS_TIMEOUT_S, client_options, socket_of
 from daemon.cli.command import Command, Delivered
 from daemon.cli.terminal import counted, echo
 from daemon.commands import CommandError
@@ -23,7 +23,6 @@ GOOD, WARNING, CRITICAL, UNKNOWN = 0, 1, 2, 3
 _WORDS = ("OK", "WARNING", "CRITICAL", "UNKNOWN")
 _STATUS = {"warning": WARNING, "critical": CRITICAL}
 HELD_UP_S = 30.0  # alarms are looked at once a second
-TIMEOUT_S = 10.0
 
 
 class _WrongUse(click.UsageError):
@@ -64,7 +63,7 @@ def health(socket: Path | None, config: Path | None, as_json: bool) -> Delivered
 def _look(socket: Path | None, config: Path | None) -> tuple[int, list[dict[str, Any]]]:
     """Return the exit status, and what is wrong."""
     try:
-        told = request(socket_of(socket, config), "status", timeout_s=TIMEOUT_S)
+        told = request(socket_of(socket, config), "status", timeout_s=STATUS_TIMEOUT_S)
     except CommandError as error:
         return UNKNOWN, [_finding("unknown", "unreachable", "rigcal", str(error), "Look at `systemctl status rigcal`.")]
     findings = findings_of(told)

@@ -212,7 +212,10 @@ def _show_list(models: Sequence[Mapping[str, Any]]) -> None:
 def _show(model: Mapping[str, Any]) -> None:
     echo(f"model {model['id']} of rig {model['rig']} ({model['stage']}) is {model['state']}: {model['path']}")
     echo(f"  trained on {', '.join(model['sessions'])}; manifest SHA-256 {model['manifest_sha256']}")
-    for effect in model["metrics"].get("effects", ()):
+    effects = model["metrics"].get("effects", ())
+    if not effects:
+        echo("  no effect is named in it")
+    for effect in effects:
         sizes = (
             f"{name} {c['value']:.4g} {PLUS_MINUS} {INTERVAL_SIGMAS * c['standard_error']:.2g} {c['unit']} (95 %)"
             for name, c in effect["coefficients"].items()

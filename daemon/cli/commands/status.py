@@ -9,7 +9,7 @@ from typing import Any
 
 import click
 
-from daemon.cli.client import ask, client_options, utc
+from daemon.cli.client import STATUS_TIMEOUT_S, ask, client_options, utc
 from daemon.cli.command import Command
 from daemon.cli.lines.clock import clock_sentence, latency_sentence
 from daemon.cli.lines.jobs import job_line
@@ -38,7 +38,7 @@ WIDTH = 100  # where the terminal's is not known
 def status(everything: bool, frames: bool, **where: Any) -> Any:
     """Show on one screen what the rig is doing, what is wrong, and what to do next."""
     show = partial(_show_all, frames=frames) if everything or frames else _show
-    told = ask(where, "status", show)
+    told = ask(where, "status", show, STATUS_TIMEOUT_S)
     return told | {"summary": {"state": state_sentence(told), "next": next_line(told)}}
 
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import click
 
-from daemon.cli.client import client_options, socket_of
+from daemon.cli.client import STATUS_TIMEOUT_S, client_options, socket_of
 from daemon.cli.command import Command, stream_json
 from daemon.cli.lines.jobs import job_line
 from daemon.cli.lines.summary import LINES, Line, reading, state_sentence, summary
@@ -21,7 +21,6 @@ from daemon.commands import CommandError
 from daemon.control.protocol import request
 
 WIDTH = 100
-TIMEOUT_S = 10.0
 
 
 @click.command(cls=Command)
@@ -84,7 +83,7 @@ def one_line(status: Mapping[str, Any]) -> str:
 def _look(socket: Any) -> tuple[Mapping[str, Any] | None, str]:
     """Return the daemon's state; None with the reason where it does not answer."""
     try:
-        return request(socket, "status", timeout_s=TIMEOUT_S), ""
+        return request(socket, "status", timeout_s=STATUS_TIMEOUT_S), ""
     except CommandError as error:
         return None, f"connection lost, trying again: {error}"
 

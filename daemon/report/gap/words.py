@@ -50,7 +50,7 @@ def before_and_after(gap: GapResult) -> ShownError:
     """Return the error without and with the effects: on held-out rows if there are any."""
     if gap.held_out is not None:
         shared = f", {gap.shared} rows of which were fitted" if gap.shared else ""
-        return ShownError(*gap.held_out, f"on the held-out file{shared}", can_pass=not gap.shared)
+        return ShownError(*gap.held_out, f"on the held-out fixes{shared}", can_pass=not gap.shared)
     if gap.rounds and not gap.rounds[-1].adopted:
         left_out = f", {_outliers(gap)} left out" if gap.model.outliers else ""
         rows = f"on poses held out in turn{left_out}"

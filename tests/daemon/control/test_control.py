@@ -116,7 +116,7 @@ def test_no_daemon_is_one_sentence(tmp_path: Path) -> None:
 
 
 def test_a_silent_daemon_is_one_sentence(path: Path) -> None:
-    with pytest.raises(CommandError, match=r"did not answer within 0\.1 s"):
+    with pytest.raises(CommandError, match=r"did not answer within 0\.1 s: it hangs"):
         request(path, "wait", timeout_s=0.1)
 
 

@@ -127,8 +127,8 @@ def test_one_family_at_several_joints_is_one_step() -> None:
 
 def test_the_held_out_file_goes_before_poses_held_out_in_turn(pending: Outline) -> None:
     gap = replace(support.named(), held_out=(11.0, 3.2))
-    assert before_and_after(gap) == (11.0, 3.2, "on the held-out file", True)
-    assert "Root mean square error on the held-out file." in pending.text
+    assert before_and_after(gap) == (11.0, 3.2, "on the held-out fixes", True)
+    assert "Root mean square error on the held-out fixes." in pending.text
 
 
 @pytest.mark.parametrize(
