@@ -21,7 +21,7 @@ from typing import Any
 from playwright.sync_api import Browser, Page
 from playwright.sync_api import TimeoutError as PageTimeoutError
 
-from tests.daemon.daemon_process import DaemonProcess
+from tests.daemon.support.daemon_process import DaemonProcess
 from tests.daemon.web.web_support import WebProcess
 from tests.simulated.guided_operator import GuidedOperator
 from tests.web.browser import DEADLINE_MS, PHONE, TABLET, chromium, launched, open_live

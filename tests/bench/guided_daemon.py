@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from daemon.commands import CommandError
-from tests.daemon.daemon_process import DaemonProcess
+from tests.daemon.support.daemon_process import DaemonProcess
 from tests.simulated.guided_operator import GuidedOperator
 
 

@@ -22,7 +22,7 @@ from typing import Any
 from playwright.sync_api import ViewportSize
 
 from tests.bench.year_store import build
-from tests.daemon.daemon_process import DaemonProcess
+from tests.daemon.support.daemon_process import DaemonProcess
 from tests.daemon.web.web_support import WebProcess
 from tests.web.browser import TABLET, chromium, launched, open_live
 

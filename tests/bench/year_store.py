@@ -36,7 +36,7 @@ from daemon.store.upkeep.packing import SPAN_NS, packed_run
 from drivers.clock import NS_PER_S, Stamp
 from drivers.readings import Capture, Fix, Reading
 from tests.bench.store_growth import CONFIG, UTC_0_NS, traffic
-from tests.daemon.idle_daemon import idle_daemon
+from tests.daemon.support.idle_daemon import idle_daemon
 
 MINUTES = 10  # of simulated traffic, again and again
 SESSION_EVERY = 600  # minutes

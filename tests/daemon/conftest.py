@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from daemon.store import Store
-from tests.daemon.job_support import JobRig
+from tests.daemon.support.jobs import JobRig
 
 
 @pytest.fixture

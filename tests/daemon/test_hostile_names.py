@@ -29,9 +29,9 @@ from daemon.service import declare_channels
 from daemon.store.store import Store
 from drivers.clock import ManualClock
 from drivers.readings import DecodeFailure, DeviceEvent, EventKind, Fix, LockState, Status
-from tests.daemon.idle_daemon import idle_daemon
-from tests.daemon.job_support import SOURCE
-from tests.daemon.report_inputs import report_input
+from tests.daemon.support.idle_daemon import idle_daemon
+from tests.daemon.support.jobs import SOURCE
+from tests.daemon.support.report_inputs import report_input
 
 CLI = Path(main.callback.__code__.co_filename).parent if main.callback is not None else Path()
 # Printable: taken as they are, and shown so.

@@ -12,7 +12,7 @@ import pytest
 from daemon.store.reader import Reader
 from drivers.readings import CanCapture
 from tests.commands import run_apart
-from tests.daemon.daemon_process import DaemonProcess
+from tests.daemon.support.daemon_process import DaemonProcess
 
 SIM = ("--sim", "--rate", "25", "--seed", "3", "--dwell", "2.5")
 

@@ -8,8 +8,8 @@ from daemon.store.store import Store
 from drivers.can.tip_frames import TipStatus
 from drivers.clock import ManualClock
 from drivers.readings import DeviceEvent, EventKind, Fix, LockState, Reading, Record, Status
-from tests.daemon.job_support import SOURCE
-from tests.daemon.model_support import ModelRig, pose, wait
+from tests.daemon.support.jobs import SOURCE
+from tests.daemon.support.models import ModelRig, pose, wait
 
 
 class RealClock(ManualClock):

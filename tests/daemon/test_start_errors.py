@@ -18,8 +18,8 @@ from daemon.config.config import Config
 from daemon.service import Daemon
 from daemon.store import Store, StoreError
 from drivers.clock import SystemClock
-from tests.daemon.damage import fill, small_disk
-from tests.daemon.job_support import SOURCE
+from tests.daemon.support.damage import fill, small_disk
+from tests.daemon.support.jobs import SOURCE
 
 CONFIG = """rig = "swdt82"
 state_directory = "{state}"

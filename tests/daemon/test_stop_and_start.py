@@ -25,10 +25,10 @@ from daemon.service import Daemon
 from daemon.store import Reader, Store
 from drivers.clock import SystemClock
 from drivers.readings import Capture, LinkItem, Record
-from tests.daemon.acquisition_support import DEADLINE_S, ListLink, NumberDecoder, values, wait_until
-from tests.daemon.damage import fill_up, tear
-from tests.daemon.job_support import SOURCE
-from tests.daemon.store_support import frame, reading, serial_bytes, table
+from tests.daemon.support.acquisition import DEADLINE_S, ListLink, NumberDecoder, values, wait_until
+from tests.daemon.support.damage import fill_up, tear
+from tests.daemon.support.jobs import SOURCE
+from tests.daemon.support.store import frame, reading, serial_bytes, table
 
 
 @pytest.fixture

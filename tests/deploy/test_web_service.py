@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from daemon.control.protocol import request
-from tests.daemon.idle_daemon import idle_daemon
+from tests.daemon.support.idle_daemon import idle_daemon
 from tests.deploy.conftest import DEPLOY, program, run
 from tests.deploy.test_service import settings
 

@@ -19,7 +19,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.daemon.daemon_process import DaemonProcess
+from tests.daemon.support.daemon_process import DaemonProcess
 from tests.docs.pages import ROOT, Block, blocks, fault_of, fault_of_mention, inline_commands, pages
 
 pytestmark = pytest.mark.timeout(1200)  # a busy computer compiles kernels for minutes

@@ -31,7 +31,7 @@ from drivers.logs.can_log import read_can_log, write_can_log
 from drivers.logs.serial_log import read_serial_log
 from drivers.readings import CanCapture, SerialCapture
 from tests.calibration.rig.exchange import test_from_table, test_from_urdf
-from tests.daemon.offline_support import held_out_csv, train_csv
+from tests.daemon.support.offline import held_out_csv, train_csv
 from tests.drivers.stations.exports import test_exports
 from tests.fuzz.streams import pack_frames, pack_pieces
 from tests.fuzz.target import CORPUS

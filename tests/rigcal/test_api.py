@@ -17,8 +17,8 @@ import rigcal
 from calibration.rig.description import Rig, shipped_rig
 from simulators.effects.library import parse_effects
 from simulators.rig.truth import RigTruth
-from tests.daemon.session_support import Rig as SimulatedRig
-from tests.daemon.session_support import controlled
+from tests.daemon.support.sessions import Rig as SimulatedRig
+from tests.daemon.support.sessions import controlled
 from tests.simulated.observations import simulate_observations
 
 ROOT = Path(__file__).parents[2]

@@ -9,7 +9,7 @@ import polars as pl
 import pytest
 
 import rigcal
-from tests.daemon.session_support import Rig, controlled
+from tests.daemon.support.sessions import Rig, controlled
 
 
 @pytest.fixture

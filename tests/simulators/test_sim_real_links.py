@@ -30,8 +30,8 @@ from drivers.errors import LinkError
 from simulators.__main__ import main
 from simulators.link_ends import BusEnd, SerialEnd
 from simulators.plan import read_plan
-from tests.daemon.acquisition_support import wait_until
-from tests.daemon.idle_daemon import running as run_daemon
+from tests.daemon.support.acquisition import wait_until
+from tests.daemon.support.idle_daemon import running as run_daemon
 from tests.drivers.multicast import GROUP, multicast_bus, unused_port
 
 RIG = shipped_rig("swdt82")

@@ -9,8 +9,8 @@ from pathlib import Path
 from daemon.config.config import Config
 from daemon.store.queries.setups import SetupTable
 from drivers.clock import NS_PER_S
-from tests.daemon.idle_daemon import idle_daemon
-from tests.daemon.model_support import ModelRig
+from tests.daemon.support.idle_daemon import idle_daemon
+from tests.daemon.support.models import ModelRig
 
 DAY_S = 86_400.0
 STAGES = (("nominal", 9.1), ("geometric", 1.9), ("effects", 1.3), ("hybrid", 1.2))

@@ -12,8 +12,8 @@ import pytest
 from playwright.sync_api import Page, expect
 from playwright.sync_api import TimeoutError as PageTimeoutError
 
-from tests.daemon.daemon_process import DaemonProcess
-from tests.daemon.model_support import ModelRig
+from tests.daemon.support.daemon_process import DaemonProcess
+from tests.daemon.support.models import ModelRig
 from tests.daemon.web.web_support import WebProcess
 from tests.simulated.guided_operator import GuidedOperator
 from tests.web.browser import open_live, violations

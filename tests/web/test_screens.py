@@ -17,7 +17,7 @@ from daemon.config.config import Config
 from daemon.control.protocol import request
 from daemon.control.server import ControlServer
 from daemon.web.access import Role, TokenFile
-from tests.daemon.idle_daemon import idle_daemon
+from tests.daemon.support.idle_daemon import idle_daemon
 from tests.daemon.web.web_support import WebProcess
 from tests.web.browser import DEADLINE_MS, PHONE, TABLET, open_live, violations
 from tests.web.conftest import NewPage

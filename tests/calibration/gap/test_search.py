@@ -24,7 +24,7 @@ from simulators.blind.scene import SceneSettings, draw_scene
 from simulators.blind.visibility import Visibility
 from simulators.effects.library import parse_effects
 from simulators.rig.truth import RigTruth
-from tests.daemon.gap_support import session_csv
+from tests.daemon.support.gap import session_csv
 from tests.simulated.observations import simulate_observations
 
 SOURCE = load_rig("swdt82")

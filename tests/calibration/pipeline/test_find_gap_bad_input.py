@@ -20,7 +20,7 @@ from calibration.model.warnings import model_warnings
 from calibration.observations import Observations, parse_observations
 from calibration.pipeline.find_gap import find_gap
 from calibration.run_settings import Run
-from tests.daemon import gap_support as support
+from tests.daemon.support import gap as support
 
 
 def session(poses: int, seed: int = 5, hidden: str = support.HIDDEN) -> Observations:

@@ -11,7 +11,7 @@ from daemon.acquisition.acquisition import Acquisition
 from daemon.store import Store
 from drivers.clock import SystemClock
 from drivers.readings import LinkLoop
-from tests.daemon.acquisition_support import Make, NumberDecoder
+from tests.daemon.support.acquisition import Make, NumberDecoder
 
 
 @pytest.fixture

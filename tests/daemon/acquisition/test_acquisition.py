@@ -25,7 +25,7 @@ from drivers.readings import (
     LinkItem,
     Record,
 )
-from tests.daemon.acquisition_support import (
+from tests.daemon.support.acquisition import (
     ListLink,
     Make,
     NumberDecoder,
@@ -34,8 +34,8 @@ from tests.daemon.acquisition_support import (
     values,
     wait_until,
 )
-from tests.daemon.damage import fill_up
-from tests.daemon.store_support import at, frame, serial_bytes, table
+from tests.daemon.support.damage import fill_up
+from tests.daemon.support.store import at, frame, serial_bytes, table
 
 # ---- the ordinary way ------------------------------------------------------------------------------------------------
 

@@ -29,7 +29,7 @@ from drivers.readings import (
     LinkItem,
     Record,
 )
-from tests.daemon.acquisition_support import (
+from tests.daemon.support.acquisition import (
     DEADLINE_S,
     ListLink,
     Make,
@@ -38,8 +38,8 @@ from tests.daemon.acquisition_support import (
     values,
     wait_until,
 )
-from tests.daemon.damage import fill_up, make_room
-from tests.daemon.store_support import at, frame, table
+from tests.daemon.support.damage import fill_up, make_room
+from tests.daemon.support.store import at, frame, table
 from tests.drivers.multicast import GROUP, multicast_bus, unused_port
 
 # ---- losses are never silent -----------------------------------------------------------------------------------------
@@ -285,7 +285,7 @@ def test_a_writer_that_hangs_is_not_alive(acquire: Make) -> None:
 
 def run_process(path: Path, *arguments: int) -> subprocess.Popen[str]:
     process = subprocess.Popen(
-        [sys.executable, "-m", "tests.daemon.acquisition_support", str(path), *map(str, arguments)],
+        [sys.executable, "-m", "tests.daemon.support.acquisition", str(path), *map(str, arguments)],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,

@@ -16,8 +16,8 @@ from drivers.can.raw_signal import BitField, SignalChannel, SignalDecoder
 from drivers.can_decoder import IDS_MAX, CanDecoder
 from drivers.clock import ManualClock
 from drivers.readings import CanCapture, LinkItem
-from tests.daemon.acquisition_support import ListLink, NumberDecoder, wait_until
-from tests.daemon.store_support import at, serial_bytes
+from tests.daemon.support.acquisition import ListLink, NumberDecoder, wait_until
+from tests.daemon.support.store import at, serial_bytes
 
 PUMP = SignalChannel(
     name="pump", unit="bar", arbitration_id=0x201, field=BitField(0, 8), counter=BitField(8, 4), timeout_s=60.0

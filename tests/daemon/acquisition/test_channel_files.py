@@ -15,7 +15,7 @@ from drivers.can.dbc import DbcFile
 from drivers.canopen.pdo import PdoField, PdoMapping, TransmitPdo
 from drivers.errors import DescriptionError
 from tests.bench.store_growth import CONFIG
-from tests.daemon.rig_file_support import ANOTHER_FACTOR, ANOTHER_LENGTH, Change, decoded_rig, own_rig
+from tests.daemon.support.rig_files import ANOTHER_FACTOR, ANOTHER_LENGTH, Change, decoded_rig, own_rig
 
 PUMP = "frame 201h, 16 unsigned bits from intel bit 0, 0.1 * integer + 0.0 bar"
 THETA1 = "frame 1A0h, 32 bits from bit 0, object 6004h.0"

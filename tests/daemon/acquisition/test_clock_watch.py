@@ -11,8 +11,8 @@ from daemon.acquisition.clock_watch import ClockWatch
 from daemon.store import Store
 from drivers.clock import NS_PER_S, ManualClock, ScaledClock, Stamp, SystemClock
 from drivers.readings import EventKind
-from tests.daemon.acquisition_support import ListLink, NumberDecoder, wait_until
-from tests.daemon.store_support import at, frame, table
+from tests.daemon.support.acquisition import ListLink, NumberDecoder, wait_until
+from tests.daemon.support.store import at, frame, table
 
 
 class SetClock(SystemClock):

@@ -19,9 +19,9 @@ from drivers.canopen.pdo import TransmitPdo
 from drivers.canopen.supervision import VOIDS
 from drivers.clock import SystemClock
 from drivers.readings import CanCapture, DeviceEvent, EventKind
-from tests.daemon.acquisition_support import ListLink, Make
-from tests.daemon.damage import tear
-from tests.daemon.store_support import table
+from tests.daemon.support.acquisition import ListLink, Make
+from tests.daemon.support.damage import tear
+from tests.daemon.support.store import table
 from tests.drivers.can_support import EDS, at, capture
 
 PDO = "1A0 00 40 00 00"

@@ -25,7 +25,7 @@ from drivers.readings import (
     Record,
     Status,
 )
-from tests.daemon.store_support import at, fix, reading
+from tests.daemon.support.store import at, fix, reading
 
 THETA = JointInput("theta1", "deg", 0.03)
 LENGTH = JointInput("L2", "mm", 1.2)

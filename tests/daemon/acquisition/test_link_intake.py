@@ -16,7 +16,7 @@ from daemon.store import Store
 from drivers.clock import SystemClock
 from drivers.readings import CanCapture, DeviceEvent, EventKind, Gap, GapReason, LinkItem
 from simulators.replay import ReplayLink
-from tests.daemon.acquisition_support import DEADLINE_S, ListLink, wait_until
+from tests.daemon.support.acquisition import DEADLINE_S, ListLink, wait_until
 
 
 def test_the_time_from_the_start_of_a_run_until_a_link_is_open_is_a_gap(tmp_path: Path) -> None:

@@ -28,8 +28,8 @@ from daemon.store.upkeep.packing import Packing
 from drivers.clock import NS_PER_S, Stamp
 from drivers.readings import Capture
 from tests.bench.store_growth import CONFIG, UTC_0_NS, traffic
-from tests.daemon.rig_file_support import ANOTHER_FACTOR, ANOTHER_ZERO, decoded_rig
-from tests.daemon.store_support import table
+from tests.daemon.support.rig_files import ANOTHER_FACTOR, ANOTHER_ZERO, decoded_rig
+from tests.daemon.support.store import table
 
 SECONDS = 6.0
 SOURCE = load_rig("swdt82")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from daemon.acquisition.thinning import Thinning
 from drivers.clock import NS_PER_S, Stamp
 from drivers.readings import DecodeFailure, Reading, Record, Status
-from tests.daemon.store_support import at, fix, reading
+from tests.daemon.support.store import at, fix, reading
 
 
 def outside(_: Stamp) -> bool:

@@ -17,8 +17,8 @@ from daemon.store import Store
 from daemon.store.queries.alarms import AlarmTable
 from daemon.store.queries.jobs import FailedJob
 from drivers.clock import ManualClock
-from tests.daemon.damage import fill_up, make_room
-from tests.daemon.store_support import at, table
+from tests.daemon.support.damage import fill_up, make_room
+from tests.daemon.support.store import at, table
 
 
 @rule("critical", "Plug it in.", after_s=2.0, hold_s=3.0)

@@ -16,7 +16,7 @@ from daemon.store.queries.jobs import FailedJob, JobTable
 from daemon.store.queries.sessions import SessionTable
 from daemon.store.queries.setups import SetupRow, SetupTable
 from drivers.readings import DeviceEvent, EventKind
-from tests.daemon.model_support import ModelRig, wait
+from tests.daemon.support.models import ModelRig, wait
 
 
 @pytest.fixture

@@ -23,10 +23,10 @@ from daemon.rig_files import load_rig
 from daemon.service import Daemon
 from daemon.store import Store
 from tests.daemon.acquisition.test_clock_watch import SetClock
-from tests.daemon.acquisition_support import wait_until
-from tests.daemon.daemon_process import DaemonProcess
-from tests.daemon.idle_daemon import running as run_daemon
-from tests.daemon.store_support import table
+from tests.daemon.support.acquisition import wait_until
+from tests.daemon.support.daemon_process import DaemonProcess
+from tests.daemon.support.idle_daemon import running as run_daemon
+from tests.daemon.support.store import table
 
 CONFIG = """rig = "swdt82"
 state_directory = "."

@@ -16,7 +16,7 @@ from daemon.cli import commands
 from daemon.cli.client import socket_of
 from daemon.cli.main import main
 from daemon.commands import INSTALLED_SOCKET
-from tests.daemon.idle_daemon import idle_daemon
+from tests.daemon.support.idle_daemon import idle_daemon
 
 HEAVY = ("numpy", "scipy", "pydantic", "rich", "matplotlib", "numba", "lightgbm")
 NEW = '''

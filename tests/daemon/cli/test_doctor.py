@@ -13,7 +13,7 @@ from click.testing import CliRunner, Result
 from daemon.cli.diagnosis import can_interface, daemon_state
 from daemon.cli.main import main
 from daemon.config.sections import CanSection
-from tests.daemon.idle_daemon import idle_daemon
+from tests.daemon.support.idle_daemon import idle_daemon
 
 SECTION = CanSection(channel="can0", bitrate=250_000)
 CONFIG = (

@@ -17,7 +17,7 @@ from daemon.host.safe_output import write_file
 from daemon.models.gap_files import check_gap_target, gap_answer, write_gap
 from daemon.models.model_files import read_model
 from tests.commands import run
-from tests.daemon import gap_support as support
+from tests.daemon.support import gap as support
 
 CONTRACT = [
     "verdict", "effects", "indistinguishable", "description", "remaining", "disabled", "rms_before_mm", "rms_after_mm",

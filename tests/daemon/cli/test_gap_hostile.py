@@ -12,7 +12,7 @@ import pytest
 from click.testing import CliRunner
 
 from daemon.cli.main import main as rigcal
-from tests.daemon import gap_support as support
+from tests.daemon.support import gap as support
 
 Table = dict[str, list[str]]
 

@@ -12,9 +12,9 @@ from daemon.cli.commands.health import HELD_UP_S, findings_of
 from daemon.cli.main import main
 from daemon.control.protocol import request
 from tests.daemon.acquisition.test_clock_watch import SetClock
-from tests.daemon.acquisition_support import wait_until
 from tests.daemon.alarms.test_alarms_daemon import running
-from tests.daemon.idle_daemon import idle_daemon
+from tests.daemon.support.acquisition import wait_until
+from tests.daemon.support.idle_daemon import idle_daemon
 
 
 def health(*arguments: str) -> Result:

@@ -12,7 +12,7 @@ import pytest
 
 from daemon.models.model_files import write_model
 from tests.commands import run
-from tests.daemon.offline_support import held_out_csv, small_calibration
+from tests.daemon.support.offline import held_out_csv, small_calibration
 
 Table = list[dict[str, str]]
 JOINTS = [f"q{i}_deg" for i in range(1, 7)]

@@ -29,7 +29,7 @@ from drivers.can.tip_frames import TipMessage, TipStatus, encode_tip
 from drivers.errors import TransmitForbiddenError
 from tests.commands import run_apart
 from tests.daemon.config.test_config import GOOD, check
-from tests.daemon.model_support import SOURCE, ModelRig, written
+from tests.daemon.support.models import SOURCE, ModelRig, written
 
 TIP = """
 [tip]

@@ -20,7 +20,7 @@ from daemon.cli.commands.calibrate import METHODS
 from daemon.cli.commands.predict import INTERVAL_COLUMNS, PREDICTED_COLUMNS
 from daemon.models.model_files import write_model
 from tests.commands import run
-from tests.daemon.offline_support import held_out_csv, small_calibration, train_csv
+from tests.daemon.support.offline import held_out_csv, small_calibration, train_csv
 
 KEYS = [
     "rig", "n", "fitted", "seconds", "stages", "per_prism", "effects", "residual", "residual_reason", "noise_mm",

@@ -13,7 +13,7 @@ from calibration.rig.description import Rig, shipped_rig
 from daemon.models.model_files import write_model
 from simulators.rig.truth import RigTruth
 from tests.commands import answer, run
-from tests.daemon.offline_support import small_calibration
+from tests.daemon.support.offline import small_calibration
 from tests.simulated.observations import simulate_observations
 
 KEYS = [

@@ -13,7 +13,7 @@ import pytest
 
 from calibration.rig.description import shipped_rig
 from tests.commands import run
-from tests.daemon.offline_support import held_out_csv, train_csv
+from tests.daemon.support.offline import held_out_csv, train_csv
 
 MM_PER_DEG = 0.8
 SAID = (

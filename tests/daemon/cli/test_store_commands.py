@@ -13,8 +13,8 @@ from click.testing import CliRunner, Result
 from daemon.cli import client
 from daemon.cli.main import main
 from daemon.store import Store
-from tests.daemon.idle_daemon import idle_daemon
-from tests.daemon.store_support import frame
+from tests.daemon.support.idle_daemon import idle_daemon
+from tests.daemon.support.store import frame
 
 CONFIG = 'rig = "swdt82"\nstate_directory = "."\n[[can]]\nchannel = "can0"\n[store]\nbackup_directory = "backups"\n'
 

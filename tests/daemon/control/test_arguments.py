@@ -14,7 +14,7 @@ from daemon.control.command_table import COMMANDS, READING
 from daemon.control.protocol import request
 from tests.daemon.control.test_control import talk
 from tests.daemon.control.test_rights import OWN_GROUP
-from tests.daemon.idle_daemon import idle_daemon
+from tests.daemon.support.idle_daemon import idle_daemon
 
 
 @pytest.fixture(scope="module")

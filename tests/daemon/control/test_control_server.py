@@ -19,7 +19,7 @@ from daemon.commands import REFUSED, CommandError, caller_has_left, reading_sock
 from daemon.control.protocol import request
 from daemon.control.server import ControlServer, Limits
 from daemon.host.systemd import Notifier
-from tests.daemon.idle_daemon import idle_daemon
+from tests.daemon.support.idle_daemon import idle_daemon
 
 DEADLINE_S = 60.0
 

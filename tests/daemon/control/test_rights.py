@@ -22,9 +22,9 @@ from daemon.config.config import Config, ConfigError, parse_config
 from daemon.control.command_table import READING
 from daemon.control.protocol import how_to_be_let_in, request
 from daemon.store.reader import Reader
-from tests.daemon.acquisition_support import wait_until
-from tests.daemon.idle_daemon import idle_daemon
-from tests.daemon.model_support import ModelRig
+from tests.daemon.support.acquisition import wait_until
+from tests.daemon.support.idle_daemon import idle_daemon
+from tests.daemon.support.models import ModelRig
 
 OWN_GROUP = grp.getgrgid(os.getegid()).gr_name
 OWN_USER = pwd.getpwuid(os.geteuid()).pw_name

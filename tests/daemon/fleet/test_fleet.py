@@ -24,7 +24,7 @@ from daemon.fleet.sources import find_rigs
 from daemon.store import Store
 from daemon.store.queries.observations import ObservationTable
 from daemon.store.queries.sessions import SessionTable
-from tests.daemon.store_support import at
+from tests.daemon.support.store import at
 from tests.simulated.fleet import COMMON, ODD, drawing, simulated_rig, write_rig
 
 RIGS, ODD_EVERY = 12, 12

@@ -7,7 +7,7 @@ from daemon.acquisition.joiner import ObservationJoiner, joint_inputs, signal_in
 from daemon.guide.course import Course
 from daemon.guide.job import Request
 from daemon.guide.meter_link import Place
-from tests.daemon.session_support import SOURCE, Rig, closed_afterwards
+from tests.daemon.support.sessions import SOURCE, Rig, closed_afterwards
 
 rig = closed_afterwards(Rig)
 

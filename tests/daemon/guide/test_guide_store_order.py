@@ -14,9 +14,9 @@ from daemon.acquisition.joiner import ObservationJoiner, joint_inputs, signal_in
 from daemon.commands import HOW_TO_END, CommandError
 from daemon.guide.manager import GuideManager
 from daemon.guide.meter_link import Place
-from tests.daemon.damage import fill_up, make_room
-from tests.daemon.session_support import SOURCE, Rig, closed_afterwards, disk_fails
-from tests.daemon.store_support import table
+from tests.daemon.support.damage import fill_up, make_room
+from tests.daemon.support.sessions import SOURCE, Rig, closed_afterwards, disk_fails
+from tests.daemon.support.store import table
 
 POSE = {joint.column: sum(joint.limits) / 2 for joint in SOURCE.rig.joints}
 

@@ -10,7 +10,7 @@ import pytest
 from daemon.acquisition.joiner import ObservationJoiner, joint_inputs, signal_inputs
 from drivers.readings import DeviceEvent, EventKind, Record
 from tests.daemon.guide.test_guide_store_order import POSE, GuidedRig
-from tests.daemon.session_support import STEP_S, closed_afterwards
+from tests.daemon.support.sessions import STEP_S, closed_afterwards
 
 
 class WatchedRig(GuidedRig):

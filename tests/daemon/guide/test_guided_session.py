@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 from daemon.commands import REFUSED, CommandError
-from tests.daemon.daemon_process import DaemonProcess
+from tests.daemon.support.daemon_process import DaemonProcess
 from tests.simulated.guided_operator import GuidedOperator
 
 pytestmark = pytest.mark.long

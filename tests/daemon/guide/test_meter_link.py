@@ -11,7 +11,7 @@ import pytest
 from daemon.guide import meter_link
 from daemon.guide.meter_link import Answer, MeterLink, Place
 from daemon.host.ended_threads import EndedThreads
-from tests.daemon.acquisition_support import wait_until
+from tests.daemon.support.acquisition import wait_until
 
 PLACE = Place("rigcal.sqlite", None, "")
 DIES_IN_AN_ANSWER = """import sys

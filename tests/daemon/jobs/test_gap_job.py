@@ -18,8 +18,8 @@ from daemon.store.queries.jobs import JobTable
 from daemon.store.queries.models import ModelTable
 from simulators.effects.library import parse_effects
 from simulators.rig.truth import RigTruth
-from tests.daemon.job_support import SOURCE, JobRig
-from tests.daemon.model_support import written
+from tests.daemon.support.jobs import SOURCE, JobRig
+from tests.daemon.support.models import written
 from tests.simulated.observations import simulate_observations
 
 LOOSE = "backlash@theta4:width_rad=3e-3"

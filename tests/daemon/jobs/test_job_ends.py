@@ -14,7 +14,7 @@ from daemon.jobs.child import JobChild
 from daemon.jobs.job_queue import JobQueue
 from daemon.jobs.order import Order, Outcome, Progress, Started, parse_message
 from drivers.clock import NS_PER_S
-from tests.daemon.job_support import JobRig, is_gone
+from tests.daemon.support.jobs import JobRig, is_gone
 
 
 def test_data_that_determine_nothing_fail_in_a_sentence_whatever_lies_in_the_current_directory(

@@ -15,7 +15,7 @@ import pytest
 
 from daemon.jobs.child import JOB_COMMAND, JobChild
 from daemon.jobs.order import Order, Outcome, Started
-from tests.daemon.job_support import DEADLINE_S, JobRig, is_gone
+from tests.daemon.support.jobs import DEADLINE_S, JobRig, is_gone
 
 Listen = Callable[[Sequence[str]], Path]
 

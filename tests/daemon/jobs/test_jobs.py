@@ -17,7 +17,7 @@ from daemon.models.model_files import model_sha256, read_model
 from daemon.store.errors import NotInStoreError
 from daemon.store.migrations import MIGRATIONS
 from drivers.clock import NS_PER_S, Stamp
-from tests.daemon.job_support import JobRig, is_gone
+from tests.daemon.support.jobs import JobRig, is_gone
 
 
 def table(rig: JobRig) -> JobQueue:

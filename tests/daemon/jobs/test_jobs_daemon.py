@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from tests.daemon.daemon_process import DaemonProcess
-from tests.daemon.job_support import JobRig, is_gone
+from tests.daemon.support.daemon_process import DaemonProcess
+from tests.daemon.support.jobs import JobRig, is_gone
 
 pytestmark = pytest.mark.long
 

@@ -20,7 +20,7 @@ from daemon.store.reader import Reader
 from simulators.effects.library import parse_effects
 from simulators.rig.dataset import SimulatedObservations
 from simulators.rig.truth import RigTruth
-from tests.daemon.job_support import SOURCE, JobRig
+from tests.daemon.support.jobs import SOURCE, JobRig
 from tests.simulated.runs import simulate_runs
 
 LATE_S = 0.1

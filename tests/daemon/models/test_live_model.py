@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from daemon.models.live_model import Loaded, Missing
-from tests.daemon.model_support import ModelRig, wait
+from tests.daemon.support.models import ModelRig, wait
 
 
 @pytest.fixture

@@ -19,7 +19,7 @@ from drivers.can.tip_frames import TipStatus, encode_tip
 from drivers.can_link import CanLink
 from drivers.clock import NS_PER_S, Stamp, SystemClock
 from drivers.readings import DeviceEvent, EventKind, Status
-from tests.daemon.model_support import TRUTH, ModelRig, pose
+from tests.daemon.support.models import TRUTH, ModelRig, pose
 from tests.drivers.can_support import running, unused_channel
 
 

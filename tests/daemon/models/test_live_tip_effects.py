@@ -19,8 +19,8 @@ from drivers.can.tip_frames import TipStatus
 from drivers.clock import NS_PER_S, Stamp
 from simulators.effects.library import parse_effects
 from simulators.rig.truth import RigTruth
-from tests.daemon.job_support import SOURCE, START
-from tests.daemon.model_support import PRISMS, ModelRig, pose
+from tests.daemon.support.jobs import SOURCE, START
+from tests.daemon.support.models import PRISMS, ModelRig, pose
 
 JUMP = "transducer_index_jump@L2:jump_mm=12:time_s=900"
 CONSTANT = "prism_constant@station:mm=34.4"

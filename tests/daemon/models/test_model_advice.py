@@ -9,7 +9,7 @@ import pytest
 
 from daemon.cli.lines.state import model_lines
 from daemon.commands import CommandError
-from tests.daemon.model_support import ModelRig
+from tests.daemon.support.models import ModelRig
 
 
 @pytest.fixture

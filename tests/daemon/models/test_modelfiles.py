@@ -19,7 +19,7 @@ from calibration.model.prediction import Predictor
 from calibration.observations import parse_observations
 from daemon.models import model_files as modelfiles
 from daemon.models.model_files import check_target, model_sha256, read_model, read_model_of_rig, write_model
-from tests.daemon.offline_support import held_out_csv, small_calibration
+from tests.daemon.support.offline import held_out_csv, small_calibration
 
 
 @pytest.fixture(scope="module")

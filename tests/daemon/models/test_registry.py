@@ -29,8 +29,8 @@ from daemon.store.migrations import MIGRATIONS
 from daemon.store.queries.models import ModelRow, ModelTable
 from drivers.clock import NS_PER_S, Stamp
 from drivers.readings import DeviceEvent, EventKind
-from tests.daemon.job_support import SOURCE, TRUTH, JobRig
-from tests.daemon.model_support import PRISMS, ModelRig, wait, written
+from tests.daemon.support.jobs import SOURCE, TRUTH, JobRig
+from tests.daemon.support.models import PRISMS, ModelRig, wait, written
 from tests.simulated.observations import simulate_observations
 
 

@@ -27,8 +27,8 @@ from daemon.service import Daemon
 from daemon.store import Store
 from drivers.clock import ManualClock
 from drivers.readings import DeviceEvent, EventKind, Gap, GapReason
-from tests.daemon.acquisition_support import wait_until
-from tests.daemon.idle_daemon import running as run_daemon
+from tests.daemon.support.acquisition import wait_until
+from tests.daemon.support.idle_daemon import running as run_daemon
 
 ROOT = Path(__file__).parents[3]
 GOLDEN = ROOT / "tests" / "golden" / "simulated" / "standing" / "boom.log"

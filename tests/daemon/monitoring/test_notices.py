@@ -26,11 +26,11 @@ from daemon.monitoring import delivery, outbox
 from daemon.monitoring.notice import LISTED, Notice, message_of
 from daemon.monitoring.outbox import Pace
 from daemon.store.queries.alarms import AlarmTable
-from tests.daemon.acquisition_support import wait_until
-from tests.daemon.idle_daemon import idle_daemon
-from tests.daemon.notice_support import FAST, SECRET, Sender, WebServer
-from tests.daemon.session_support import disk_fails
-from tests.daemon.store_support import at, table
+from tests.daemon.support.acquisition import wait_until
+from tests.daemon.support.idle_daemon import idle_daemon
+from tests.daemon.support.notices import FAST, SECRET, Sender, WebServer
+from tests.daemon.support.sessions import disk_fails
+from tests.daemon.support.store import at, table
 
 
 @pytest.fixture

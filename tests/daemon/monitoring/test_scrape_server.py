@@ -16,7 +16,7 @@ import pytest
 
 from daemon.monitoring import scrape_server
 from daemon.monitoring.metrics_server import MetricsServer, StatusCollector
-from tests.daemon.acquisition_support import wait_until
+from tests.daemon.support.acquisition import wait_until
 
 NO_STACK_BYTES = 1 << 47  # of a thread: more than a process can have, so that none is begun
 

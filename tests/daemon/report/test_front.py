@@ -16,8 +16,8 @@ from daemon.report.front import Facts, judge
 from daemon.report.gap.page import gap_report
 from daemon.report.pdf import HOW_TO_INSTALL
 from daemon.report.plain_names import coefficient_words, constant_words, in_words, unit_words
-from tests.daemon import gap_support
-from tests.daemon.report_inputs import report_input
+from tests.daemon.support import gap as gap_support
+from tests.daemon.support.report_inputs import report_input
 
 LABELS = ["Rig", "Model", "Sessions", "Operator", "Instrument", "Station set-up", "UTC", "Software"]
 FACTS = Facts(

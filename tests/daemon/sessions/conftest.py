@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.daemon.session_support import Rig
+from tests.daemon.support.sessions import Rig
 
 
 @pytest.fixture

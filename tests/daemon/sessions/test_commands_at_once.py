@@ -11,9 +11,9 @@ from typing import Any
 import pytest
 
 from daemon.store.queries.observations import OF_CONTROL_POINT
-from tests.daemon.damage import fill_up, make_room
-from tests.daemon.session_support import STEP_S, Rig, disk_fails
-from tests.daemon.store_support import table
+from tests.daemon.support.damage import fill_up, make_room
+from tests.daemon.support.sessions import STEP_S, Rig, disk_fails
+from tests.daemon.support.store import table
 
 POINT_MM = (9000.0, 500.0, 2000.0)
 

@@ -10,7 +10,7 @@ from daemon.commands import CommandError, acting_for
 from daemon.store.queries.guides import GuideTable
 from daemon.store.queries.sessions import SessionTable
 from daemon.store.queries.setups import SetupTable
-from tests.daemon.session_support import Rig, controlled
+from tests.daemon.support.sessions import Rig, controlled
 
 CP1 = (9000.0, 500.0, 2000.0)
 MOVED = (9000.0, 600.0, 2000.0)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from daemon.store.queries.sessions import ZERO_LOST, SessionTable
 from daemon.store.queries.zeros import lost_zeros
 from drivers.readings import DeviceEvent, EventKind
-from tests.daemon.session_support import SOURCE, Rig, controlled
+from tests.daemon.support.sessions import SOURCE, Rig, controlled
 
 LOST = f"{ZERO_LOST}theta1"
 

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from drivers.readings import Fix
-from tests.daemon.session_support import Rig, closed_afterwards, controlled
-from tests.daemon.store_support import table
+from tests.daemon.support.sessions import Rig, closed_afterwards, controlled
+from tests.daemon.support.store import table
 
 
 class ConstantRig(Rig):

@@ -28,9 +28,9 @@ from simulators.devices.stations.total_station import StationSettings
 from simulators.faults import parse_faults
 from simulators.rig.truth import RigTruth
 from simulators.rig_simulator import RigSimulator, SimulatorSettings
-from tests.daemon.session_support import closed_afterwards, disk_fails
 from tests.daemon.sessions.test_sessions import SOURCE, Rig, start
-from tests.daemon.store_support import table
+from tests.daemon.support.sessions import closed_afterwards, disk_fails
+from tests.daemon.support.store import table
 from tests.simulated.captures import Step, generate
 from tests.simulated.scripted_host import ScriptedHost
 

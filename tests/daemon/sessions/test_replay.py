@@ -35,7 +35,7 @@ from drivers.stations.survey import position_mm
 from simulators.devices.stations.total_station import StationSettings
 from simulators.rig.truth import RigTruth
 from simulators.rig_simulator import RigSimulator, SimulatorSettings
-from tests.daemon.acquisition_support import ListLink, wait_until
+from tests.daemon.support.acquisition import ListLink, wait_until
 from tests.golden.regenerate import CONFIG
 from tests.simulated.captures import Step, generate
 from tests.simulated.scripted_host import ScriptedHost

@@ -15,8 +15,8 @@ from daemon.rig_files import misreading
 from daemon.sessions.session_data import sessions_csv
 from daemon.store.queries.sessions import SessionTable
 from rigcal.store_api import open_store
-from tests.daemon.rig_file_support import ANOTHER_FACTOR, ANOTHER_LENGTH, ANOTHER_ZERO, L2, decoded_rig, own_rig
-from tests.daemon.session_support import SOURCE, Rig, controlled
+from tests.daemon.support.rig_files import ANOTHER_FACTOR, ANOTHER_LENGTH, ANOTHER_ZERO, L2, decoded_rig, own_rig
+from tests.daemon.support.sessions import SOURCE, Rig, controlled
 
 ANOTHER_NODE = (L2, L2.replace("48", "58"))
 OTHER_TIMES = (L2, f"{L2}heartbeat_ms = 500\ntimeout_s = 3.0\n")

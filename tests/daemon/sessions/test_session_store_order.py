@@ -21,8 +21,8 @@ from daemon.jobs.scheduler import CHAIN, DueChain, next_job
 from daemon.store.errors import unwritable_errors
 from daemon.store.migrations import MIGRATIONS
 from daemon.store.store import Store
-from tests.daemon.damage import fill_up, make_room
-from tests.daemon.session_support import SOURCE, Rig, another_program_writes, disk_fails
+from tests.daemon.support.damage import fill_up, make_room
+from tests.daemon.support.sessions import SOURCE, Rig, another_program_writes, disk_fails
 
 
 def open_sessions(rig: Rig) -> list[str]:

@@ -16,7 +16,7 @@ from daemon.jobs.order import Order, Outcome
 from daemon.jobs.scheduler import CHAIN, CHECKS, DueChain, due_jobs, next_job
 from daemon.store.errors import NotInStoreError
 from drivers.clock import NS_PER_S
-from tests.daemon.session_support import Rig, controlled
+from tests.daemon.support.sessions import Rig, controlled
 
 CP1 = (9000.0, 500.0, 2000.0)
 ELSEWHERE = (9000.0, 520.0, 2000.0)

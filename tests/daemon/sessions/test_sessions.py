@@ -24,8 +24,8 @@ from daemon.store.errors import NotInStoreError
 from daemon.store.reader import Reader
 from drivers.clock import NS_PER_S, Stamp
 from drivers.readings import DeviceEvent, EventKind, Record
-from tests.daemon import session_support
-from tests.daemon.session_support import SOURCE, STEP_S, Rig, closed_afterwards
+from tests.daemon.support import sessions as session_support
+from tests.daemon.support.sessions import SOURCE, STEP_S, Rig, closed_afterwards
 
 rig = closed_afterwards(Rig)
 

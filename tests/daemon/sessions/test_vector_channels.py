@@ -17,7 +17,7 @@ from drivers.clock import Stamp
 from drivers.errors import DescriptionError
 from drivers.logs.can_log import FORMATS, read_can_log, write_can_log
 from drivers.readings import CanCapture
-from tests.daemon.session_support import Rig
+from tests.daemon.support.sessions import Rig
 
 BEGIN = Stamp(1_795_800_000_000_000_000, 5_000_000_000, "b")
 TOLD = SessionFile(prism="r", kind="check", since_utc_ns=0, until_utc_ns=1, control_points={})

@@ -9,7 +9,7 @@ from daemon.sessions.without_job import why_no_job
 from daemon.store.queries.jobs import JobTable
 from daemon.store.queries.sessions import SessionTable
 from daemon.store.reader import Reader
-from tests.daemon.job_support import JobRig
+from tests.daemon.support.jobs import JobRig
 
 
 def reasons(rig: JobRig, **options: Any) -> dict[str, str | None]:

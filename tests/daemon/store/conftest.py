@@ -11,7 +11,7 @@ from daemon.store import Store
 from daemon.store.queries.observations import ObservationTable
 from daemon.store.queries.sessions import SessionTable
 from drivers.readings import Status
-from tests.daemon.store_support import at, fix, reading
+from tests.daemon.support.store import at, fix, reading
 
 
 @pytest.fixture

@@ -18,7 +18,7 @@ from daemon.store.describe.description import StoreDescription, describe_store
 from daemon.store.describe.metadata import datasette_metadata
 from daemon.store.queries.observations import ObservationTable
 from daemon.store.queries.sessions import SessionTable
-from tests.daemon.store_support import at, fix, reading
+from tests.daemon.support.store import at, fix, reading
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")  # of its own imports

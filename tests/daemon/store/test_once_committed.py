@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from daemon.store import Store
-from tests.daemon.session_support import disk_fails
+from tests.daemon.support.sessions import disk_fails
 
 
 @pytest.fixture

@@ -30,7 +30,7 @@ from drivers.readings import (
     Reading,
     Status,
 )
-from tests.daemon.store_support import BOOT, at, fix, frame, reading, serial_bytes, table
+from tests.daemon.support.store import BOOT, at, fix, frame, reading, serial_bytes, table
 
 HOLDER = """
 import sys, time

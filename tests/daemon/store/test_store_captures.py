@@ -18,7 +18,7 @@ from daemon.store.packed_captures import packed, unpacked
 from daemon.store.upkeep.packing import packed_run
 from drivers.clock import Stamp
 from drivers.readings import CanCapture, Capture, SerialCapture
-from tests.daemon.store_support import at, frame, serial_bytes
+from tests.daemon.support.store import at, frame, serial_bytes
 
 INT64 = st.integers(-(2**63), 2**63 - 1)
 STAMPS = st.builds(Stamp, INT64, INT64, st.sampled_from(["boot-a", "boot-b", "Anschluß"]), st.booleans())

@@ -14,11 +14,11 @@ import pytest
 from daemon.store import Store, health
 from daemon.store.health import StoreWatch
 from drivers.clock import ManualClock, Stamp
-from tests.daemon.acquisition_support import wait_until
-from tests.daemon.damage import tear
-from tests.daemon.session_support import disk_fails
-from tests.daemon.store_support import at, fix
-from tests.daemon.watch_support import results, settled, watched
+from tests.daemon.support.acquisition import wait_until
+from tests.daemon.support.damage import tear
+from tests.daemon.support.sessions import disk_fails
+from tests.daemon.support.store import at, fix
+from tests.daemon.support.watch import results, settled, watched
 
 
 class FaultyClock(ManualClock):

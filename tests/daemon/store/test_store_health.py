@@ -24,12 +24,12 @@ from daemon.store import Reader, Store, StoreError
 from daemon.store.files import FileIdentity
 from drivers.clock import SystemClock
 from drivers.readings import Capture
-from tests.daemon.acquisition_support import ListLink, wait_until
-from tests.daemon.damage import fill, small_disk, tear
-from tests.daemon.idle_daemon import running as run_daemon
-from tests.daemon.job_support import SOURCE, JobRig
-from tests.daemon.store_support import frame, table
-from tests.daemon.watch_support import results, settled, watched
+from tests.daemon.support.acquisition import ListLink, wait_until
+from tests.daemon.support.damage import fill, small_disk, tear
+from tests.daemon.support.idle_daemon import running as run_daemon
+from tests.daemon.support.jobs import SOURCE, JobRig
+from tests.daemon.support.store import frame, table
+from tests.daemon.support.watch import results, settled, watched
 
 # ---- damage ----------------------------------------------------------------------------------------------------------
 

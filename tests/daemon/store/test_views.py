@@ -9,7 +9,7 @@ from daemon.store import Store
 from daemon.store.describe.table_words import TABLES
 from daemon.store.describe.view_words import VIEWS
 from docs.references.schema import example
-from tests.daemon.store_support import rows
+from tests.daemon.support.store import rows
 
 
 def test_observations_have_iso_times_and_joints_as_columns(session_path: Path) -> None:

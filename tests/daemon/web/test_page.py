@@ -15,7 +15,7 @@ import pytest
 from daemon.config.config import Config
 from daemon.store.reader import Reader
 from daemon.web.server import REQUEST_S
-from tests.daemon.idle_daemon import idle_daemon
+from tests.daemon.support.idle_daemon import idle_daemon
 from tests.daemon.web.web_support import WebProcess, wait_for
 
 STATE_FRESH_S = 2.0

@@ -13,8 +13,8 @@ from daemon.sessions.session_data import sessions_csv
 from daemon.store.reader import Reader
 from daemon.web.residuals import SessionFixes
 from daemon.web.shape import shape
-from tests.daemon.job_support import SOURCE, JobRig
-from tests.daemon.model_support import written
+from tests.daemon.support.jobs import SOURCE, JobRig
+from tests.daemon.support.models import written
 
 
 @pytest.fixture

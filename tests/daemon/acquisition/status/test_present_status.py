@@ -20,8 +20,8 @@ from daemon.rig_files import load_rig
 from daemon.store import Store
 from drivers.clock import NS_PER_S, ManualClock, Stamp
 from drivers.readings import Capture, DecodeFailure, DeviceEvent, EventKind, Gap, GapReason, LinkItem, Record
-from tests.daemon.acquisition_support import DEADLINE_S, ListLink, NumberDecoder, wait_until
-from tests.daemon.store_support import at, frame, serial_bytes
+from tests.daemon.support.acquisition import DEADLINE_S, ListLink, NumberDecoder, wait_until
+from tests.daemon.support.store import at, frame, serial_bytes
 
 EXPECTED = Expected(
     (

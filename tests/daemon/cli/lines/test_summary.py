@@ -19,7 +19,7 @@ from daemon.cli.lines.jobs import job_line, percent
 from daemon.cli.lines.summary import LINES, state_sentence, summary
 from daemon.cli.main import main
 from daemon.next_step import next_line
-from tests.daemon.idle_daemon import idle_daemon
+from tests.daemon.support.idle_daemon import idle_daemon
 
 TERMINAL = (100, 24)
 

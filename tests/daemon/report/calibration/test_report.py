@@ -10,7 +10,7 @@ import pytest
 from daemon.report.calibration.inputs import EffectLine, ErrorTable, spread
 from daemon.report.calibration.page import calibration_report, headline
 from daemon.report.words import number, signed
-from tests.daemon.report_inputs import report_input
+from tests.daemon.support.report_inputs import report_input
 
 VOID = {"meta", "img", "br"}
 

@@ -11,7 +11,7 @@ from calibration.evaluation.evaluation import evaluate
 from calibration.observations import parse_observations
 from daemon.report.calibration.from_model import report_input
 from daemon.report.calibration.page import calibration_report
-from tests.daemon.offline_support import held_out_csv, small_calibration
+from tests.daemon.support.offline import held_out_csv, small_calibration
 
 
 def test_report_of_a_model_has_the_figures_of_its_evaluation() -> None:

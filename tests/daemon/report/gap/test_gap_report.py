@@ -15,8 +15,8 @@ from daemon.report.gap.figures import apparent, error_maps
 from daemon.report.gap.page import bars, gap_report, intervals
 from daemon.report.gap.words import before_and_after, closed_share, gap_headline, tolerance_verdict
 from daemon.report.words import odds, readable_unit, spoken
-from tests.daemon import gap_support as support
 from tests.daemon.report.calibration.test_report import Outline
+from tests.daemon.support import gap as support
 
 SOURCES = {"data": "session.csv, SHA-256 abc"}
 

@@ -13,7 +13,7 @@ from daemon.sessions.replay import merged
 from daemon.store.errors import StoreError
 from drivers.clock import NS_PER_S, Stamp
 from drivers.readings import CanCapture, SerialCapture
-from tests.daemon.session_support import Rig
+from tests.daemon.support.sessions import Rig
 
 CONFIG = """
 rig = "swdt82"

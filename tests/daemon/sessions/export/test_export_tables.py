@@ -21,7 +21,7 @@ from daemon.store import Store
 from daemon.store.queries.observations import ObservationTable
 from daemon.store.queries.sessions import SessionTable
 from drivers.readings import SerialCapture
-from tests.daemon.store_support import at, fix, reading
+from tests.daemon.support.store import at, fix, reading
 
 CONFIG = 'rig = "swdt82"\nstate_directory = "."\n[[can]]\nchannel = "can0"\n[[station]]\nserial.path = "/dev/station"\n'
 RIG = shipped_rig("swdt82")

@@ -16,10 +16,10 @@ from daemon.sessions.prisms.evidence import IdentityLoader, PrismEvidence, Sight
 from daemon.sessions.station_setups import Place
 from drivers.readings import EventKind
 from simulators.rig.truth import RigTruth
-from tests.daemon.acquisition_support import wait_until
-from tests.daemon.rig_file_support import ANOTHER_ZERO
-from tests.daemon.session_support import SOURCE, Rig, closed_afterwards, disk_fails
-from tests.daemon.store_support import table
+from tests.daemon.support.acquisition import wait_until
+from tests.daemon.support.rig_files import ANOTHER_ZERO
+from tests.daemon.support.sessions import SOURCE, Rig, closed_afterwards, disk_fails
+from tests.daemon.support.store import table
 
 RIG = SOURCE.rig
 TRUTH = RigTruth(RIG, 5)

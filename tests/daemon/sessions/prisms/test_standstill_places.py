@@ -1,7 +1,7 @@
 """Two places in one standstill: the fixes of the minority are excluded, and more fixes may turn the decision."""
 
 from daemon.sessions.prisms.standstill_places import EVERY_FIX, Exclusions, StandstillPlaces
-from tests.daemon.session_support import SOURCE, STEP_S, Rig
+from tests.daemon.support.sessions import SOURCE, STEP_S, Rig
 
 JOINTS = {j.column: sum(j.limits) / 2 for j in SOURCE.rig.joints}
 PRISM = (3000.0, 8000.0, 1000.0)

@@ -8,9 +8,9 @@ from daemon.acquisition.joiner import JoinedFix
 from daemon.sessions.prisms.motion import LATE_S, TargetMotion
 from drivers.clock import ManualClock
 from drivers.readings import Fix, LockState, Status
-from tests.daemon.session_support import SOURCE, STEP_S, closed_afterwards
 from tests.daemon.sessions.prisms.test_prism_evidence import TrueRig, place_mm
-from tests.daemon.store_support import table
+from tests.daemon.support.sessions import SOURCE, STEP_S, closed_afterwards
+from tests.daemon.support.store import table
 
 RIG = SOURCE.rig
 FIX_PERIOD_S = 0.35  # in which the guard takes any prism for able to move 1.85 m

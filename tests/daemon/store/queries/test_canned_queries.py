@@ -12,7 +12,7 @@ from sqlite_utils import Database
 
 from daemon.store.queries.canned_queries import canned_queries
 from daemon.store.views import Channel, channels_of
-from tests.daemon.store_support import rows
+from tests.daemon.support.store import rows
 
 
 def test_every_canned_query_runs_and_is_right(session_path: Path) -> None:

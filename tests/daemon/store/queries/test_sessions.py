@@ -13,7 +13,7 @@ from sqlite_utils import Database
 from daemon.store import Reader, Store, StoreError
 from daemon.store.migrations import MIGRATIONS
 from daemon.store.queries.sessions import SessionTable, session
-from tests.daemon.store_support import at, rows
+from tests.daemon.support.store import at, rows
 
 
 def test_a_rig_file_is_stored_once(session_path: Path) -> None:

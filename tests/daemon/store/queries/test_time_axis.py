@@ -12,7 +12,7 @@ from daemon.sessions.session_data import sessions_csv
 from daemon.store.queries.time_axis import TimeAxis, time_axis
 from daemon.store.reader import Reader
 from drivers.clock import NS_PER_S, Stamp
-from tests.daemon.session_support import SOURCE, STEP_S, Rig, closed_afterwards, controlled
+from tests.daemon.support.sessions import SOURCE, STEP_S, Rig, closed_afterwards, controlled
 
 HOUR_S = 3600.0
 YEARS_S = 5 * 365 * 86_400.0

@@ -25,9 +25,9 @@ from daemon.store.upkeep.daily_backups import DailyBackups
 from daemon.store.upkeep.housekeeping import Housekeeping, Keeping
 from daemon.store.upkeep.soundness import MANIFEST, check_store
 from drivers.clock import NS_PER_S, ManualClock
-from tests.daemon.acquisition_support import wait_until
-from tests.daemon.damage import small_disk
-from tests.daemon.store_support import BOOT, UTC_0, at, frame, table
+from tests.daemon.support.acquisition import wait_until
+from tests.daemon.support.damage import small_disk
+from tests.daemon.support.store import BOOT, UTC_0, at, frame, table
 
 
 def nothing() -> None:

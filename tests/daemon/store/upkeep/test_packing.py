@@ -12,7 +12,7 @@ from daemon.store import Reader, Store
 from daemon.store.reader import CHUNKS
 from daemon.store.upkeep.packing import Packing
 from drivers.readings import Capture
-from tests.daemon.store_support import at, frame, serial_bytes, table
+from tests.daemon.support.store import at, frame, serial_bytes, table
 
 
 def append(store: Store, captures: list[Capture], *, decoded: bool = True) -> None:

@@ -17,8 +17,8 @@ from daemon.store.upkeep.housekeeping import Housekeeping, Keeping
 from daemon.store.upkeep.retention import Retention, cutoff_ns, room
 from drivers.clock import NS_PER_S, ManualClock, Stamp
 from drivers.readings import Capture, Fix, Reading
-from tests.daemon.damage import small_disk
-from tests.daemon.store_support import at, fix, frame, reading, table
+from tests.daemon.support.damage import small_disk
+from tests.daemon.support.store import at, fix, frame, reading, table
 
 MINUTE_S = 60.0
 NOW_NS = 1_800_000_000 * NS_PER_S  # of the wall clock, at 0 s

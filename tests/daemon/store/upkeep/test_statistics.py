@@ -9,7 +9,7 @@ import pytest
 
 from daemon.store import Store, StoreError
 from daemon.store.upkeep.statistics import statistics
-from tests.daemon.store_support import frame
+from tests.daemon.support.store import frame
 
 
 def test_it_tells_size_and_contents_while_the_store_is_written_to(tmp_path: Path) -> None:

@@ -9,8 +9,8 @@ from pathlib import Path
 from daemon.store import Store
 from daemon.store.health import StoreWatch
 from drivers.clock import Clock, ManualClock
-from tests.daemon.acquisition_support import wait_until
-from tests.daemon.store_support import at, table
+from tests.daemon.support.acquisition import wait_until
+from tests.daemon.support.store import at, table
 
 
 @contextlib.contextmanager

@@ -27,7 +27,7 @@ from drivers.readings import (
     SerialCapture,
     Status,
 )
-from tests.daemon.store_support import fix, table
+from tests.daemon.support.store import fix, table
 from tests.drivers.multicast import GROUP
 
 DEADLINE_S = 20.0

@@ -11,7 +11,7 @@ from calibration.observations import parse_observations
 from calibration.pipeline.calibrate import calibrate
 from daemon.rig_files import load_rig
 
-UR10_CSV = Path(__file__).parents[1] / "data" / "ur10_random_poses.csv"
+UR10_CSV = Path(__file__).parents[2] / "data" / "ur10_random_poses.csv"
 TRAIN_ROWS, TEST_ROWS = 240, 60
 
 

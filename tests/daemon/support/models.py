@@ -28,7 +28,7 @@ from daemon.models.registry import ModelRegistry
 from daemon.store.queries.models import ModelTable
 from drivers.clock import Stamp
 from drivers.readings import Reading, Record, Status
-from tests.daemon.job_support import SOURCE, TRUTH, JobRig
+from tests.daemon.support.jobs import SOURCE, TRUTH, JobRig
 from tests.simulated.observations import simulate_observations
 
 PRISMS = ("r", "s")

@@ -15,7 +15,7 @@ from daemon.host.systemd import Notifier
 from daemon.service import Daemon
 from daemon.store.store import Store
 from drivers.clock import SystemClock
-from tests.daemon.job_support import SOURCE
+from tests.daemon.support.jobs import SOURCE
 
 
 @contextlib.contextmanager

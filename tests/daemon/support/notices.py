@@ -16,7 +16,7 @@ from daemon.store import Store
 from daemon.store.queries.alarms import AlarmTable
 from daemon.store.queries.notices import NoticeTable
 from drivers.clock import ManualClock
-from tests.daemon.store_support import at
+from tests.daemon.support.store import at
 
 FAST = Pace(gather_s=0.02, first_retry_s=0.02, longest_retry_s=0.1, per_hour=1000)
 SECRET = "T0ken"
