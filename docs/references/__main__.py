@@ -15,6 +15,7 @@ from docs.references import (
     metrics,
     python,
     rig_keys,
+    rooms,
     schema,
 )
 
@@ -29,6 +30,7 @@ PAGES: Mapping[str, Callable[[], str]] = {
     "metrics.md": metrics.page,
     "python.md": python.page,
     "rig-keys.md": rig_keys.page,
+    "rooms.svg": rooms.picture,
     "schema.md": schema.page,
 }
 
