@@ -211,6 +211,7 @@ class Daemon:
             "has_simulation_ended": self._parts.has_simulation_ended,
             "session": sessions.open_session,
             "suspicions": self._sessions.prism_suspicions,
+            "newest_excluded": partial(self._sessions.not_counting, FRESH_S),
             "prisms_fault": self._sessions.prisms_fault,
             "setup": SetupTable(self._store, self._parts.rig.name).current,
             "failed_jobs": self._job_table.failed,
@@ -257,6 +258,7 @@ class Daemon:
             self._live_model.start()
             self._acquisition.start()
             self._watch.start()
+            self._alarms.start()
             self._housekeeping.start()
             self._notices.start()
             if self._time is not None:
@@ -297,6 +299,7 @@ class Daemon:
             self._live_model.stop,
             self._jobs.stop,
             self._watch.stop,
+            self._alarms.stop,
             self._notices.stop,
             self._housekeeping.stop,
         ]

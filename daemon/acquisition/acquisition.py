@@ -14,7 +14,7 @@ import sqlite3
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from operator import itemgetter
 from typing import TypeVar
@@ -50,6 +50,7 @@ T = TypeVar("T")
 
 ALIVE_NS = NS_PER_S
 RETRY_S = 1.0
+WRITE_HUNG_S = 4.0  # real seconds after which a write that has not ended is told
 STOP_S = 15.0  # real seconds
 LINKS_STOP_S = 5.0  # of them for all links together, which look at `stop` several times a second
 LAST_RETRIES = 3  # when stopping, RETRY_S apart; then what could not be stored is given up, and the log says how much
@@ -169,7 +170,8 @@ class Acquisition:
     def status(self) -> AcquisitionStatus:
         """A snapshot, from any thread."""
         summaries = self._decoding.summaries(self._clock.now())
-        return self._board.snapshot(self._intakes, summaries, self._decoding.defects(), is_behind=self.is_behind)
+        state = self._board.snapshot(self._intakes, summaries, self._decoding.defects(), is_behind=self.is_behind)
+        return replace(state, is_write_hung=self._writer is not None and not self.alive(WRITE_HUNG_S))
 
     @property
     def is_behind(self) -> bool:

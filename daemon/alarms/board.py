@@ -27,6 +27,7 @@ log = logging.getLogger(__name__)
 
 GRACE_S = 15.0  # links have opened by then, and devices have been heard, or have not
 CLEARED_SHOWN = 200
+STOP_S = 5.0
 UNWRITTEN_MAX = 1000  # cleared alarms that wait for a store that cannot be written
 
 _LEVELS: Mapping[Severity, int] = {"warning": logging.WARNING, "critical": logging.ERROR}
@@ -93,9 +94,22 @@ class AlarmBoard:
         self._unwritten: deque[_Active] = deque(maxlen=UNWRITTEN_MAX)  # cleared ones
         self._failed_rules: dict[str, str] = {}
         self._told = ""  # the fault of this board that the log has last
+        self._to_write, self._stopping = threading.Event(), False
+        self._writer = threading.Thread(target=self._run, name="alarms", daemon=True)
+
+    def start(self) -> None:
+        """Begin to write alarms to the store, in a thread of its own: a disk may not answer for long."""
+        self._writer.start()
+
+    def stop(self) -> None:
+        """Write what is not written yet and end the thread. Harmless when not started."""
+        self._stopping = True
+        self._to_write.set()
+        if self._writer.is_alive():
+            self._writer.join(STOP_S)
 
     def evaluate(self) -> None:
-        """Look at everything that is known now; never raises."""
+        """Look at everything that is known now; never raises, and waits for no disk."""
         try:
             evidence = self._gather()
             found = self._found(replace(evidence, unwatched={**evidence.unwatched, **self._failed_rules}))
@@ -103,7 +117,7 @@ class AlarmBoard:
                 self._raise(found, evidence.now)
                 self._clear(found, evidence.now)
                 self._looked = evidence.now
-            self._write()
+            self._to_write.set()
         except Exception as error:
             if str(error) != self._told:
                 log.exception("the alarms could not be looked at")
@@ -164,12 +178,17 @@ class AlarmBoard:
                 is_worse = alarm.severity == "critical" != active.alarm.severity
                 active.alarm, active.seen, active.hold_s = alarm, now, rule.hold_s
                 if is_worse:
-                    self._tell(_notice("raised", active, now))
+                    self._report_raised(active, now)
             elif now.since(self._sighted[key]) >= rule.after_s * NS_PER_S:
                 self._active[key] = _Active(alarm, now, now, rule.hold_s)
-                self._tell(_notice("raised", self._active[key], now))
-                said = alarm.kind, alarm.subject, alarm.text, alarm.remedy
-                log.log(_LEVELS[alarm.severity], "alarm %s, %s: %s. %s", *said)
+                self._report_raised(self._active[key], now)
+
+    def _report_raised(self, active: _Active, now: Stamp) -> None:
+        """Send and log an alarm that is raised, or that has become critical."""
+        self._tell(_notice("raised", active, now))
+        alarm = active.alarm
+        said = alarm.kind, alarm.subject, alarm.text, alarm.remedy
+        log.log(_LEVELS[alarm.severity], "alarm %s, %s: %s. %s", *said)
 
     def _clear(self, found: Mapping[tuple[str, str], object], now: Stamp) -> None:
         for key, active in list(self._active.items()):
@@ -183,14 +202,24 @@ class AlarmBoard:
                 lasted = duration(max(now.since(active.raised) / NS_PER_S, 0.0))
                 log.info("alarm %s, %s is over after %s", active.alarm.kind, active.alarm.subject, lasted)
 
-    def _write(self) -> None:
+    def _run(self) -> None:
+        while not self._stopping:
+            self._to_write.wait()
+            self._to_write.clear()
+            self.write()
+
+    def write(self) -> None:
         """Bring the store up to date; what cannot be written now is written the next time."""
+        with self._turn:
+            cleared, active = list(self._unwritten), list(self._active.values())
         try:
-            while self._unwritten:
-                self._write_one(self._unwritten[0])
-                self._unwritten.popleft()
-            for active in self._active.values():
-                self._write_one(active)
+            for one in cleared:
+                self._write_one(one)
+                with self._turn:
+                    if self._unwritten and self._unwritten[0] is one:  # a full queue drops its oldest by itself
+                        self._unwritten.popleft()
+            for one in active:
+                self._write_one(one)
         except (sqlite3.Error, StoreError):
             log.debug("alarms cannot be written", exc_info=True)  # there is an alarm about that
 

@@ -29,6 +29,7 @@ class Evidence:
         has_simulation_ended: the process of a simulated rig has ended.
         session: the open one.
         suspicions: stations that may be on another prism than the session's own.
+        newest_excluded: why the open session's newest fix does not count, a clause; None where it does, or is old.
         prisms_fault: why the joints cannot be asked whether a station is on its prism; None where they can.
         setup: the one that the station stands in.
         failed_jobs: those that somebody should look at.
@@ -54,6 +55,7 @@ class Evidence:
     has_simulation_ended: bool = False
     session: OpenSessionRow | None = None
     suspicions: Sequence[Suspicion] = ()
+    newest_excluded: str | None = None
     prisms_fault: str | None = None
     setup: SetupRow | None = None
     failed_jobs: Sequence[FailedJob] = ()
@@ -79,7 +81,7 @@ class Evidence:
     @property
     def is_storing(self) -> bool:
         """True if captures are stored, and so decoded: until they are, every device looks silent and may not be."""
-        return self.acquisition.error is None
+        return self.acquisition.error is None and not self.acquisition.is_write_hung
 
     def standing(self, kind: EventKind, *ended_by: EventKind) -> list[EventStatus]:
         """Events of a kind that their device has not taken back: by a later one of `ended_by`, or by code 0."""
@@ -113,6 +115,7 @@ _PARTS = {
     "has_simulation_ended": "the simulated rig",
     "session": "the open session",
     "suspicions": "the prisms",
+    "newest_excluded": "the newest fix",
     "prisms_fault": "what the joints say of prisms",
     "setup": "the set-ups",
     "failed_jobs": "the jobs",

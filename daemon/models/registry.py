@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from calibration.errors import CalibrationError
+from calibration.errors import CalibrationError, ModelError, UnsafeError
 from daemon.commands import REFUSED, CommandError, caller_columns, text_argument
 from daemon.models.live_model import LiveModel
 from daemon.store.queries.models import ModelRow, ModelTable
@@ -196,6 +196,8 @@ class ModelRegistry:
             try:
                 self._load(model)
             except CommandError as error:
+                if not isinstance(error.__cause__, ModelError | UnsafeError):
+                    raise  # the computer's fault, as when memory is short: the next time it may load
                 refusal = str(error)
             self._loaded = loaded = files, refusal
         if loaded[1] is not None:

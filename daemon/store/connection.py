@@ -176,7 +176,7 @@ class Connection:
     def _forget_rows(self) -> None:
         """Empty the caches of row numbers: a transaction that made some of these rows was rolled back."""
         self._boots.clear()
-        self._boot_ids.clear()
+        self._boot_ids = {}  # a new one: another thread may be looking something up in the old one
 
     def reader(self) -> Reader:
         """A read-only view of this very store, for what the writing connection must not wait for.
@@ -268,10 +268,10 @@ class Connection:
 
     def stamp(self, row: Mapping[str, object], prefix: str = "") -> Stamp:
         """The instant in a row's `<prefix>utc_ns`, ..., which are not NULL."""
-        with self._turn:
-            if row[f"{prefix}boot_id"] not in self._boot_ids:
-                self._boot_ids = {boot["id"]: boot["kernel_boot_id"] for boot in self.rows("SELECT * FROM boots")}
-            return stamp_of(row, self._boot_ids, prefix)
+        known = self._boot_ids
+        if row[f"{prefix}boot_id"] not in known:
+            known = self._boot_ids = {boot["id"]: boot["kernel_boot_id"] for boot in self.rows("SELECT * FROM boots")}
+        return stamp_of(row, known, prefix)
 
     def boot_row(self, stamp: Stamp) -> int:
         """The row of `boots` that `stamp` belongs to, made on first sight."""

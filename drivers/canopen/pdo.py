@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import configparser
 import io
+import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +21,7 @@ from drivers.files import read_whole
 from drivers.readings import DeviceEvent, Record
 
 _FILE_MAX_BYTES = 2 << 20
+_BLANKS = re.compile(r"[^\S\n]+")
 
 TPDO_COMMUNICATION = 0x1800
 TPDO_MAPPING = 0x1A00
@@ -218,7 +220,9 @@ def _import(path: Path, node: int) -> ObjectDictionary:
     try:
         # EDS files are ASCII by CiA 306; makers write Latin-1 into names
         # Whatever the file is called: canopen reads XML from one that is called .epf
-        file = io.StringIO(read_whole(path, _FILE_MAX_BYTES).decode("latin-1"), newline=None)
+        text = io.StringIO(read_whole(path, _FILE_MAX_BYTES).decode("latin-1"), newline=None).read()
+        # configparser takes time with the square of a run of blanks
+        file = io.StringIO(_BLANKS.sub(" ", text))
         dictionary: ObjectDictionary = import_eds(file, node)  # type: ignore[no-untyped-call]
         return dictionary
     except OSError as error:

@@ -231,6 +231,46 @@ def test_a_run_whose_captures_were_lost_at_its_end_did_not_end_in_order(tmp_path
     assert [row["clean"] for row in table(path, "daemon_runs")] == [0]
 
 
+def test_a_disk_that_never_answers_is_an_alarm_and_does_not_keep_the_daemon_from_stopping(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(acquisition_module, "WRITE_HUNG_S", 0.5)
+    monkeypatch.setattr("daemon.service.STOP_S", 4.0)
+    monkeypatch.setattr("daemon.store.connection.CLOSE_TIMEOUT_S", 0.1)
+    gate, hangs, go_on = threading.Event(), threading.Event(), threading.Event()
+    store, daemon = composed(tmp_path, ListLink("boom", [frame(n) for n in range(100)], gate))
+    writer_hangs = threading.Event()
+
+    def hang(sql: str) -> None:  # SQLite calls it just before the commit
+        if sql == "COMMIT" and hangs.is_set() and threading.current_thread().name == "writer":
+            writer_hangs.set()
+            go_on.wait(DEADLINE_S)
+
+    store._db.conn.set_trace_callback(hang)
+    stop = threading.Event()
+
+    def run() -> None:
+        with contextlib.suppress(AcquisitionError):  # what is not stored by the end
+            daemon.run(stop, Notifier({}))
+
+    running = threading.Thread(target=run)
+    running.start()
+    try:
+        wait_until(lambda: daemon._acquisition.alive(within_s=DEADLINE_S))
+        hangs.set()
+        gate.set()
+        wait_until(writer_hangs.is_set)
+        wait_until(lambda: "store_hangs" in [alarm["kind"] for alarm in daemon._alarms.status()["active"]])
+        assert daemon._sessions.open_session() is None, "what is read waits for no commit"
+        stop.set()
+        running.join(DEADLINE_S / 2)
+        assert not running.is_alive(), "the main loop waits for the commit"
+    finally:
+        go_on.set()
+        running.join()
+        store.close()
+
+
 # ---- starts ----------------------------------------------------------------------------------------------------------
 
 

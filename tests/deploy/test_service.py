@@ -100,6 +100,13 @@ def test_jobs_are_a_unit_of_their_own_with_less_of_the_computer_than_acquisition
         assert job[both] == service[both]
 
 
+def test_a_shutdown_stops_the_daemon_before_its_job_so_that_the_job_is_interrupted_and_does_not_fail() -> None:
+    job = settings(DEPLOY / "rigcal-jobs@.service")
+    assert job["BindsTo"] == ["rigcal.service"]
+    assert job["Before"] == ["rigcal.service"], "units stop in the reverse order of their start"
+    assert "After" not in job
+
+
 def test_the_clock_is_read_by_a_unit_that_cannot_set_it() -> None:
     service, reader = settings(DEPLOY / "rigcal.service"), settings(DEPLOY / "rigcal-clock@.service")
     (path,) = settings(DEPLOY / "rigcal-clock.socket")["ListenStream"]

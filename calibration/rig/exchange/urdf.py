@@ -126,6 +126,8 @@ def parse_urdf(text: str, source: str) -> Urdf:
     """
     if len(text) > LONGEST:
         raise RigError(source, "", f"it has {len(text):,} characters, {LONGEST:,} at most are read")
+    if (elements := text.count("<") - text.count("</") - text.count("<!")) > _MOST_ELEMENTS:  # before they take memory
+        raise RigError(source, "", f"it has {elements:,} elements, {_MOST_ELEMENTS:,} at most are read")
     if "<!DOCTYPE" in text:
         raise RigError(source, "", "it declares a document type, which no URDF needs and rigcal does not read")
     try:

@@ -205,6 +205,7 @@ class AcquisitionStatus:
         writer_lag_p99_s: the same, of the last minute's batches, 99th percentile.
         error: why something cannot be stored at present; None when all is well.
         is_behind: captures wait in the store to be decoded, as after a kill: readings and fixes come late.
+        is_write_hung: a write to the store does not end: its disk does not answer, or another program holds it.
     """
 
     links: list[LinkStatus] = field(default_factory=list)
@@ -221,3 +222,4 @@ class AcquisitionStatus:
     writer_lag_p99_s: float = 0.0
     error: str | None = None
     is_behind: bool = False
+    is_write_hung: bool = False

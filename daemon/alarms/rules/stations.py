@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from daemon.acquisition.status.present import SILENT, is_present
 from daemon.alarms.alarm import Finding, rule
 from daemon.alarms.evidence import Evidence
+from daemon.sessions.prisms.standstill_places import ELSEWHERE
 from drivers.readings import EventKind, GapReason, LockState
 
 _TURNED_AWAY = (LockState.STANDBY, LockState.SEARCHING, LockState.WAITING, LockState.ROTATING)
@@ -76,6 +77,22 @@ def prism_jump(evidence: Evidence) -> Iterator[Finding]:
     """
     for suspicion in evidence.suspicions:
         yield suspicion.station, f"{suspicion.reason}; its fixes do not count"
+
+
+@rule(
+    "warning",
+    "Check which prism the station is on, and cover reflections. If it is on the session's, `rigcal session "
+    "confirm-prism` says so.",
+    hold_s=10.0,
+)
+def fixes_elsewhere(evidence: Evidence) -> Iterator[Finding]:
+    """Fixes of one standstill lie at two places, too near to each other for `prism_jump`.
+
+    Those of the place with fewer fixes do not count. Cleared 10 s after the newest fix counts, or with the session.
+    """
+    why = evidence.newest_excluded
+    if evidence.session is not None and not evidence.suspicions and why is not None and why.startswith(ELSEWHERE):
+        yield evidence.session.id, f"fixes do not count: {why}"
 
 
 @rule(

@@ -23,6 +23,22 @@ def not_storing(evidence: Evidence) -> Iterator[Finding]:
         yield "store", evidence.acquisition.error
 
 
+@rule(
+    "critical",
+    "Check the disk of the store, and its cable; captures wait in memory meanwhile.",
+    after_s=1.0,
+    hold_s=5.0,
+)
+def store_hangs(evidence: Evidence) -> Iterator[Finding]:
+    """A write to the store has not ended for 4 s: its disk does not answer, or the computer is too busy.
+
+    Captures wait in memory and are stored when the write ends. If it does not, the watchdog restarts rigcal. Silence of
+    links, channels and stations raises no alarms meanwhile. Cleared 5 s after the write has ended.
+    """
+    if evidence.acquisition.is_write_hung and evidence.acquisition.error is None:
+        yield "store", "a write to the store does not end"
+
+
 @rule("critical", "Do what the alarm says before you stop rigcal: a deleted file is lost for good when rigcal stops.")
 def store_unsound(evidence: Evidence) -> Iterator[Finding]:
     """The store is damaged, or a file of it was replaced or is gone."""

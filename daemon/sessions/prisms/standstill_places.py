@@ -19,6 +19,7 @@ from daemon.sessions.station_setups import Place
 # by some tens of mm. Two prisms, or a prism and a reflection, that are nearer to each other than this look like one.
 SAME_PLACE_MM = 100.0
 MOST_PLACES = 100
+ELSEWHERE = "another prism or a reflection"  # how the reason for these exclusions begins
 SETTLED_FIXES = 50_000  # hours; what was decided by then stays
 EVERY_FIX = 64  # until a standstill has that many fixes each of them may turn the decision, later one in total / 64
 
@@ -145,11 +146,11 @@ class StandstillPlaces:
 
 
 def _another(place: _Place, prism: _Place) -> str:
-    return f"another prism or a reflection: more fixes of this standstill lie {_metres(place, prism)} m away"
+    return f"{ELSEWHERE}: more fixes of this standstill lie {_metres(place, prism)} m away"
 
 
 def _undecided(place: _Place, other: _Place) -> str:
-    return f"another prism or a reflection: as many fixes of this standstill lie {_metres(place, other)} m away"
+    return f"{ELSEWHERE}: as many fixes of this standstill lie {_metres(place, other)} m away"
 
 
 def _metres(place: _Place, other: _Place) -> str:

@@ -25,6 +25,8 @@ NO_SUM = (
     "station sends its records without check sums, so that a digit changed on the line passes unseen: switch Checksum "
     "on in the instrument's communication settings"
 )
+SUM_AGAIN = "station sends its records with checksums again"
+_SUM_CODE, _SUM_AGAIN_CODE = 1, 0  # a warning with a code stands until one with code 0, also when the port is reopened
 
 _SHORTEST_REPLY = 14  # E100 E100 E100
 _LINE_LIMIT = 128
@@ -155,6 +157,7 @@ class SetParser:
         self._station = station
         self._codes: frozenset[int] = frozenset()
         self._has_sum: bool | None = None  # None: not known yet, or in doubt
+        self._is_warned = False
 
     def parse(self, data: bytes, first_byte: Stamp, last_byte: Stamp) -> Reply:
         if data.startswith(b"A "):  # answers the set-up command A
@@ -172,14 +175,18 @@ class SetParser:
         return Reply(ReplyKind.RECORD, (*warnings, *errors, fix))
 
     def _watch_sum(self, data: bytes, first_byte: Stamp) -> list[DeviceEvent]:
-        """Return the warning, when this sound line is the first to show that the station sends no SUM."""
+        """Return a warning at the first sound line without SUM, and its end at the first with SUM again."""
         had_sum, self._has_sum = self._has_sum, carries_sum(data)
+        if self._has_sum and self._is_warned:
+            self._is_warned = False
+            return [DeviceEvent(self._station, first_byte, EventKind.WARNING, SUM_AGAIN, _SUM_AGAIN_CODE)]
         if self._has_sum or had_sum is False:
             return []
         if had_sum:
             self._has_sum = None
             raise RecordError("the line ends before its SUM, which the lines before it carry")
-        return [DeviceEvent(self._station, first_byte, EventKind.WARNING, NO_SUM)]
+        self._is_warned = True
+        return [DeviceEvent(self._station, first_byte, EventKind.WARNING, NO_SUM, _SUM_CODE)]
 
 
 CODEC = Codec(

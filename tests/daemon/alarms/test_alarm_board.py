@@ -46,6 +46,7 @@ class Rig:
         for _ in range(seconds):
             self.clock.advance(1.0)
             self.board.evaluate()
+            self.board.write()
 
     def active(self) -> list[str]:
         return [alarm["subject"] for alarm in self.board.status()["active"]]
@@ -81,6 +82,27 @@ def test_an_alarm_is_raised_once_and_cleared_once_in_store_log_and_status(
     ]
     (row,) = table(rig.path, "alarms")
     assert row["cleared_monotonic_ns"] - row["raised_monotonic_ns"] == 10_000_000_000
+
+
+def test_an_alarm_that_becomes_critical_is_logged_as_such(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    severity = ["warning"]
+
+    @rule("warning", "Free space.")
+    def disk(evidence: Evidence) -> Iterable[Finding]:
+        """It is nearly full."""
+        del evidence
+        yield "store", f"{severity[0]} space", severity[0]
+
+    rig = Rig(tmp_path / "rigcal.sqlite", [disk])
+    rig.pass_s(3)
+    severity[0] = "critical"
+    rig.pass_s(3)
+    rig.store.close()
+    told = [(r.levelname, r.getMessage()) for r in caplog.records if r.name == "daemon.alarms.board"]
+    assert told == [
+        ("WARNING", "alarm disk, store: warning space. Free space."),
+        ("ERROR", "alarm disk, store: critical space. Free space."),
+    ]
 
 
 def test_what_comes_and_goes_is_one_alarm(rig: Rig) -> None:

@@ -71,6 +71,7 @@ def known(
     frames_s: Sequence[float] = (0.1,),
     error: str | None = None,
     is_behind: bool = False,
+    is_write_hung: bool = False,
     gaps: Sequence[GapStatus] = (),
     **more: Any,
 ) -> Evidence:
@@ -84,6 +85,7 @@ def known(
         gaps=[*gaps],
         error=error,
         is_behind=is_behind,
+        is_write_hung=is_write_hung,
     )
     return Evidence(NOW, **{"running_s": 1000.0, "acquisition": acquisition, **more})
 
@@ -290,9 +292,26 @@ CASES: dict[str, list[tuple[Evidence, list[str], Evidence]]] = {
             known(event(E.PRISM_JUMP, "station"), session=SESSION),
         )
     ],
+    "fixes_elsewhere": [
+        (
+            known(session=SESSION, newest_excluded="another prism or a reflection: more fixes lie 0.20 m away"),
+            ["s001-r"],
+            known(session=SESSION, newest_excluded="moving"),
+        ),
+        (
+            known(session=SESSION, newest_excluded="another prism or a reflection: as many fixes lie 0.20 m away"),
+            ["s001-r"],
+            known(
+                session=SESSION,
+                newest_excluded="another prism or a reflection: as many fixes lie 0.20 m away",
+                suspicions=[Suspicion("station", NOW, 9.5)],
+            ),
+        ),
+    ],
     "prisms_not_compared": [(known(prisms_fault="no memory"), ["prisms"], known())],
     "decoding_behind": [(known(is_behind=True), ["decoding"], known())],
     "not_storing": [(known(error="disk full"), ["store"], known())],
+    "store_hangs": [(known(is_write_hung=True), ["store"], known())],
     "store_unsound": [(known(store=store_health("missing", "the file is gone")), ["store"], known())],
     "store_new": [(known(is_store_new=True), ["store"], known())],
     "store_short_of_room": [

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import NoReturn
 
 import pytest
 
+from calibration.errors import CalibrationError
 from daemon.cli.lines.state import model_lines
 from daemon.commands import CommandError
 from tests.daemon.support.models import ModelRig
@@ -45,6 +47,22 @@ def checked(rig: ModelRig) -> tuple[int, int]:
 
 def comparisons(rig: ModelRig, model: int) -> list[str]:
     return [job["state"] for job in rig.jobs.jobs() if (job["kind"], job["model_id"]) == ("comparison", model)]
+
+
+@pytest.mark.long
+def test_a_model_that_could_not_be_loaded_for_want_of_memory_is_recommended_once_it_can(
+    rig: ModelRig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = rig.compared(rig.candidate(), live=None)
+
+    def lacks_memory(_: object) -> NoReturn:
+        raise CalibrationError("this computer has no memory left")
+
+    with monkeypatch.context() as short:
+        short.setattr(rig.registry._live, "load", lacks_memory)
+        assert "no memory left" in advice(rig)
+    assert f"model accept {model}" in advice(rig)
+    assert rig.registry.accept_command({"id": model})["live"] == model
 
 
 @pytest.mark.long

@@ -258,6 +258,13 @@ def test_an_eds_file_larger_than_any_is_refused_before_it_is_parsed(tmp_path: Pa
         TransmitPdo.from_eds(path, 32, 1)
 
 
+def test_an_eds_file_with_a_long_run_of_blanks_does_not_hang(tmp_path: Path) -> None:
+    path = tmp_path / "device.eds"
+    path.write_bytes(b"[DeviceInfo]\na" + b" " * (1 << 20) + b"b\n" + b"\t \x0b" * 1000 + b"c\n")
+    with pytest.raises(DescriptionError, match="not a valid EDS"):
+        TransmitPdo.from_eds(path, 32, 1)
+
+
 def test_an_eds_file_is_never_read_as_xml_whatever_it_is_called(tmp_path: Path) -> None:
     path = tmp_path / "device.epf"
     path.write_bytes(b'<?xml version="1.0"?><!DOCTYPE a [<!ENTITY a "aaaa"><!ENTITY b "&a;&a;">]><a>&b;</a>')

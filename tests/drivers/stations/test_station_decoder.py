@@ -352,6 +352,15 @@ def test_a_sokkia_station_without_check_sums_is_warned_about_once() -> None:
         assert [fix.status for fix in fixes(records)] == [Status.OK] * 29
 
 
+def test_the_warning_of_no_check_sums_stands_until_they_come_again() -> None:
+    bare, full = [(k / 10, BARE_REPLY) for k in range(1, 4)], [(k / 10, FULL_REPLY) for k in range(4, 8)]
+    records = decode(decoder(profile="sokkia_set"), bare + full)
+    warned, over = (r for r in records if isinstance(r, DeviceEvent) and r.kind is EventKind.WARNING)
+    assert "switch Checksum on" in warned.text
+    assert warned.code not in (None, 0), "a warning without a code would be forgotten when the port is opened again"
+    assert (over.code, over.text) == (0, "station sends its records with checksums again")
+
+
 def test_the_identity_of_a_sokkia_station_tells_that_it_sends_no_check_sums() -> None:
     assert warnings(decode(decoder(profile="sokkia_set"), [(1, b"A SET2C,123456,4100,2506\r\n")]))
     assert not warnings(decode(decoder(profile="sokkia_set"), [(1, b"A SET2C,123456,4100,2506,39\r\n")]))

@@ -1,5 +1,6 @@
 """Rigs made from URDF: the same machine to rounding, whatever its axes, couplings and branches."""
 
+import tracemalloc
 import xml.etree.ElementTree as ET
 
 import numpy as np
@@ -194,3 +195,14 @@ def test_a_document_that_yourdfpy_reads_too() -> None:
     )
     found = [robot.get_transform(prism, "base")[:3, 3] * 1e3 for prism in rig.prism_names]
     np.testing.assert_allclose(found, prisms_mm(rig, pose)[0], rtol=0.0, atol=1e-9)
+
+
+def test_a_document_of_too_many_elements_is_refused_before_they_take_memory() -> None:
+    text = "<robot>" + '<a b=""/>' * 1_000_000 + "</robot>"
+    tracemalloc.start()
+    try:
+        with pytest.raises(RigError, match=r"1,000,001 elements, 20,000 at most"):
+            parse_urdf(text, "many.urdf")
+        assert tracemalloc.get_traced_memory()[1] < 1 << 20
+    finally:
+        tracemalloc.stop()
