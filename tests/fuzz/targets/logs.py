@@ -120,6 +120,7 @@ _DBC_WORDS = (
     *(b"VECTOR__INDEPENDENT_SIG_MSG", b"3221225472", b"BO_TX_BU_ 512 : A;\n", b"SIG_GROUP_ 512 g 1 : S;\n", b"16000"),
 )
 _EDS_WORDS = (
+    b" " * 20_000,
     *(
         b"$NODEID+0x180",
         b"[1800sub1]\n",
