@@ -1,1 +1,1 @@
-"""Guided sessions: a whole calibration, step by step, with what is still to gain."""
+"""Guided sessions: a whole calibration, step by step, with estimates of the remaining gain."""

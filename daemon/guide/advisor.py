@@ -1,4 +1,4 @@
-"""Advice on what is still to gain: asks the gain meter's process and keeps the newest answer."""
+"""Estimates of the remaining gain: queries the gain meter's process and keeps the newest answer."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from drivers.clock import Clock
 AHEAD = 5  # poses that the meter looks ahead
 
 Take = Callable[[str, list[Pose], str], None]
-"""Takes a session, the poses chosen for it, and why there are none ("" where there are)."""
+"""Receives a session, the poses chosen for it, and why there are none ("" if there are some)."""
 
 
 class Advisor:
-    """Asks the gain meter; answers come in a thread of its own.
+    """Queries the gain meter; answers arrive in a separate thread.
 
     Args:
-        place: tells where the meter finds everything.
-        training: sessions that the next model will be trained on, oldest first, without the open one.
-        clock: for when an answer came.
-        enough: told, with the session, why it is enough.
+        place: returns the locations of the meter's input.
+        training: returns the sessions that the next model will be trained on, oldest first, without the open one.
+        clock: clock for the time of an answer.
+        enough: called with a session and the reason why it has enough poses.
 
     Attributes:
-        accuracy, coverage: as of the newest answer; None before the first.
-        trouble: why there is none, a sentence; "" where there is.
+        accuracy, coverage: accuracy and coverage of the newest answer; None before the first.
+        trouble: why there is no answer, a sentence; "" if there is one.
     """
 
     def __init__(
@@ -51,7 +51,7 @@ class Advisor:
         return self._meter is not None and self._meter.is_alive
 
     def start(self) -> None:
-        """Start the process, or another one."""
+        """Start or restart the process."""
         self.close()
         try:
             self._meter = MeterLink(self._place())
@@ -65,11 +65,16 @@ class Advisor:
             meter.close()
 
     def forget(self) -> None:
-        """Begin another guide."""
+        """Discard the answers for a previous guide."""
         self.accuracy, self.coverage, self.trouble = None, None, ""
 
     def assess(self, job: Job, setup: str) -> None:
-        """Ask what to expect; of a check nothing is learned, so nothing changes."""
+        """Request the expected accuracy, which a check does not change.
+
+        Args:
+            job: job of the guide.
+            setup: station set-up.
+        """
         is_known_check = job.run.kind == CHECK and self.accuracy is not None
         if self._meter is None or job.state != "open" or not job.run.session or is_known_check:
             return
@@ -78,7 +83,15 @@ class Advisor:
         self._meter.ask(question, partial(self._take_assessment, job, prisms))
 
     def choose(self, job: Job, setup: str, count: int, seed: int, take: Take) -> bool:
-        """Ask for poses of the run; False where nobody can be asked."""
+        """Request poses of the current run; return False if no gain meter was started.
+
+        Args:
+            job: job of the guide.
+            setup: station set-up.
+            count: number of poses.
+            seed: seed of the choice.
+            take: receives the poses.
+        """
         if self._meter is None:
             return False
         is_check = job.run.kind == CHECK
@@ -117,7 +130,7 @@ class Advisor:
 
 
 def accuracy_view(job: Job, found: Mapping[str, Any] | None) -> dict[str, Any] | None:
-    """Return the newest answer as clients see it, in the light of what has happened since."""
+    """Return the newest answer as clients see it, updated for events since then."""
     if found is None:
         return None
     run, target_mm = job.run, job.request.target_mm

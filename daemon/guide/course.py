@@ -1,6 +1,6 @@
-"""The course of the open guide: every event is stored before it counts, and what follows from it by itself is done.
+"""The course of the open guide: stores every event before it takes effect, then carries out its consequences.
 
-The operator's commands (`manager`) and the guide's own thread (`worker`) make the events, and the gain meter's answers.
+Events come from the operator's commands (`manager`), the guide's thread (`worker`) and the gain meter's answers.
 """
 
 from __future__ import annotations
@@ -29,27 +29,27 @@ from drivers.clock import Clock
 
 log = logging.getLogger(__name__)
 
-_WITHOUT_SESSION = "its session was closed when rigcal started again, as it is where the rig file has changed"
-RETRY_S = 5.0  # after something failed that is tried again by itself
+_WITHOUT_SESSION = "its session was closed when rigcal restarted, as happens if the rig file has changed"
+RETRY_S = 5.0  # pause before an automatic retry
 
 
 class Course:
-    """The open guide, its poses and what is expected of them.
+    """The open guide, its poses and their expected gain.
 
     Args:
         rig: the machine.
-        store: where everything is kept.
-        sessions: told when the station leaves the prism and when it is back.
-        joiner: what is known of the joints.
+        store: the database.
+        sessions: session manager, notified when the station leaves the prism and when it is back.
+        joiner: source of joint readings.
         clock: time.
-        meter_place: tells where the gain meter finds everything.
+        meter_place: returns the locations of the gain meter's input.
 
     Attributes:
-        record: the newest guide as it is stored.
-        watch: boom and station.
-        advisor: what is still to gain.
-        standstill: the newest one of this pose whose observations count.
-        is_choosing: poses are asked for, and have not come yet.
+        record: the newest guide in the store.
+        watch: positions of boom and station.
+        advisor: estimates of the remaining gain.
+        standstill: newest standstill of this pose whose observations count.
+        is_choosing: True while requested poses have not arrived.
     """
 
     def __init__(
@@ -70,35 +70,35 @@ class Course:
 
     @contextmanager
     def at_once(self) -> Iterator[None]:
-        """All that the block changes of guide, sessions and set-ups is stored together, or nothing of it happens."""
+        """Store all changes that the block makes to guide, sessions and set-ups in one transaction, or none."""
         with self.record.turn, self._sessions.turn, self._store.transaction():
             yield
 
     def begin(self) -> None:
-        """Begin to look: a guide was opened."""
+        """Start work on a newly opened guide."""
         self.standstill, self._try_again = None, 0.0
         self.watch.begin()
         self.advisor.forget()
         self.start_advisor()
 
     def restore(self) -> None:
-        """Go on with the guide that an earlier run left, unless that is without its session."""
+        """Resume the guide that an earlier run left open, unless its session has ended."""
         self.record.restore()
         guide = self.record.opened()
         if guide is not None and self._is_without_session(guide[1]):
             log.warning("guide %d is abandoned: %s", guide[0].id, _WITHOUT_SESSION)
             self.abandon(_WITHOUT_SESSION)
-        # Fixes that were captured and are not decoded yet must not count where the station was on no prism.
+        # Fixes that were captured but not decoded yet must not count if the station was on no prism.
         for since, until in self.record.times_away():
             self._sessions.look_away(since, until)
         guide = self.record.opened()
-        if guide is not None and not guide[1].run.session:  # one that the last run had just opened, if any
+        if guide is not None and not guide[1].run.session:  # the last run may have just opened one
             self._sessions.look_away(guide[0].started)
         if self.record.is_open:
             self.start_advisor()
 
     def _is_without_session(self, job: Job) -> bool:
-        """Return True if the run's session has ended before the run; the daemon closes it in the last step."""
+        """Return True if the session of the current run ended before the last step, in which the daemon closes it."""
         if not job.run.session or job.step is None or job.step.kind == "close":
             return False
         opened = self._sessions.open_session()
@@ -106,17 +106,26 @@ class Course:
 
     @property
     def is_waiting(self) -> bool:
-        """Return True for a while after something failed that is tried again."""
+        """Return True during the pause before a retry."""
         return time.monotonic() < self._try_again
 
     def wait(self) -> None:
-        """Try nothing by itself for a while."""
+        """Pause automatic work before the next retry."""
         self._try_again = time.monotonic() + RETRY_S
 
     # ---- events ------------------------------------------------------------------------------------------------------
 
     def happen(self, kind: str, details: Mapping[str, Any], *, only_at: str = "") -> bool:
-        """Store an event and go on once it is committed; False where another step than `only_at` is on by now."""
+        """Store an event and carry out its consequences after the commit.
+
+        Args:
+            kind: kind of the event, as in `job`.
+            details: details of the event, as in `job`.
+            only_at: step at which the event must happen; "" for any.
+
+        Returns:
+            False if the guide is at a step other than `only_at`; the event is then not stored.
+        """
         with self.record.turn:
             changed = self.record.happen(kind, details, only_at)
             if changed is not None:
@@ -141,7 +150,7 @@ class Course:
             self.happen("aimed", {})
 
     def _followed(self, before: Job, job: Job) -> None:
-        """Do what follows from an event by itself."""
+        """Carry out the consequences of an event."""
         if job.state != "open":
             self.advisor.close()
             return
@@ -156,7 +165,7 @@ class Course:
     # ---- control points ----------------------------------------------------------------------------------------------
 
     def point_mm(self, name: str) -> tuple[float, float, float] | None:
-        """Return the place of a control point of the set-up; None where it is not known."""
+        """Return the place of a control point of the set-up in mm; None if it is unknown."""
         if self.record.row is None:
             return None
         known = control_points(self._store, self.record.row.setup_id)
@@ -164,16 +173,16 @@ class Course:
 
     @staticmethod
     def point(job: Job) -> str:
-        """Return the control point to shoot now, or after the poses where they are enough; "" for another step."""
+        """Return the control point to shoot now, or next if there are enough poses; "" at other steps."""
         step, following = job.step, job.run.following
         if step is None or step.kind != "poses":
             return "" if step is None else step.point
         return following.point if job.is_enough and following is not None else ""
 
-    # ---- what is still to gain ---------------------------------------------------------------------------------------
+    # ---- remaining gain ----------------------------------------------------------------------------------------------
 
     def start_advisor(self) -> None:
-        """Start the gain meter's process, or another one."""
+        """Start or restart the gain meter's process."""
         self.advisor.start()
         self.is_choosing = False
         if not self.advisor.is_alive:
@@ -189,7 +198,7 @@ class Course:
             self.advisor.assess(self.record.job, self.record.row.setup_id)
 
     def _take_enough(self, session: str, reason: str) -> None:
-        """The stop rule says stop: it counts while poses of that session are measured."""
+        """Store that the stop rule found enough poses, if poses of that session are still being measured."""
         with self.record.turn:
             job = self.record.job
             if job is None or job.run.session != session or job.step is None:
@@ -198,7 +207,12 @@ class Course:
                 self.happen("enough", {"reason": reason})
 
     def choose(self, count: int, *, as_more: bool = False) -> None:
-        """Ask for poses of the run, unless the first ones are asked for already."""
+        """Request poses of the run, unless its first poses are already requested.
+
+        Args:
+            count: number of poses.
+            as_more: True for poses in addition to those chosen before.
+        """
         job, row = self.record.job, self.record.row
         if job is None or row is None or (self.is_choosing and not as_more):
             return

@@ -1,20 +1,20 @@
-"""The job of a guide as a pure state machine: what it was asked for, what has happened, what is to be done next.
+"""The job of a guide as a pure state machine: the request, the events so far, and the next step.
 
-A job is a run for each prism and one for the check; a run is a session. Its state follows from the request and the
-events alone, so a guide that is read from the store goes on where it was. Events and their details:
+A job has a run for each prism and one for the check; a run is a session. Its state follows from the request and the
+events alone, so a guide that is read from the store continues where it was. Events and their details:
 
     opened    {session, last}                the run's session is open; the station is not on the prism yet
     planned   {poses: [{joint: number}]}     the poses of the run
     shot      {point, misclosure_mm}         the control point of this step was measured
     aimed     {}                             the station is on the prism: fixes count from now on
     measured  {pose, last}                   the pose is done: label and newest observation of its standstill
-    enough    {reason}                       the stop rule says stop
-    more      {poses: [{joint: number}]}     measure these as well
-    left      {}                             on to the control points at the session's end
+    enough    {reason}                       the stop rule found enough poses
+    more      {poses: [{joint: number}]}     measure these poses as well
+    left      {}                             go on to the control points at the session's end
     closed    {session}                      the session is closed
-    skipped   {reason, rest}                 this step, or all poses of the run that are left
-    failed    {text}                         a shot or a session's start failed; the step stays
-    stopped   {reason}                       abandoned
+    skipped   {reason, rest}                 this step, or all remaining poses of the run, are skipped
+    failed    {text}                         a shot or a session's start failed; the step stays the same
+    stopped   {reason}                       the guide is abandoned
 """
 
 from __future__ import annotations
@@ -34,15 +34,15 @@ State = Literal["to do", "done", "skipped"]
 
 @dataclass(frozen=True)
 class Request:
-    """The job that a guide was asked for.
+    """The job that was requested of a guide.
 
     Attributes:
-        control_points: to shoot at the start and at the end of every session.
-        prisms: to measure, in this order.
-        poses: most poses of a prism.
+        control_points: control points to shoot at the start and at the end of every session.
+        prisms: prisms to measure, in this order.
+        poses: maximum number of poses of a prism.
         check_poses: poses of the check, 0 for none.
-        target_mm: expected error at which it is enough; None where none was given.
-        plan: poses with the prisms in view; None where they are chosen on the spot.
+        target_mm: expected error at which there are enough poses; None if none was given.
+        plan: poses with the prisms in view; None if poses are chosen during the guide.
     """
 
     control_points: tuple[str, ...]
@@ -53,7 +53,7 @@ class Request:
     plan: tuple[tuple[Pose, tuple[str, ...]], ...] | None = None
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the request as a JSON object, as the store keeps it."""
+        """Return the request as a JSON object for the store."""
         plan = None if self.plan is None else [{"joints": dict(p), "prisms": list(seen)} for p, seen in self.plan]
         return {
             "control_points": list(self.control_points),
@@ -66,7 +66,7 @@ class Request:
 
     @classmethod
     def of(cls, stored: Mapping[str, Any]) -> Request:
-        """Read what `as_dict` made."""
+        """Read a request that `as_dict` made."""
         plan = stored["plan"]
         return cls(
             tuple(stored["control_points"]),
@@ -78,7 +78,7 @@ class Request:
         )
 
     def planned(self, prism: str) -> tuple[Pose, ...] | None:
-        """Poses of the plan in which a prism is in view; None without a plan."""
+        """Return the poses of the plan in which a prism is in view; None without a plan."""
         return None if self.plan is None else tuple(pose for pose, seen in self.plan if prism in seen)
 
 
@@ -88,8 +88,8 @@ class Step:
 
     Attributes:
         kind: what is to be done.
-        point, phase: the control point, and `start` or `end` of the session; "" for others.
-        state: whether it is done.
+        point, phase: the control point, and `start` or `end` of the session; "" for other kinds.
+        state: whether the step is done.
         reason: why it was skipped.
     """
 
@@ -105,8 +105,8 @@ class PlannedPose:
     """A pose of a run.
 
     Attributes:
-        joints: where to go; empty where it is not known yet.
-        state, reason: as of a step.
+        joints: target of every joint; empty if not known yet.
+        state, reason: as in `Step`.
     """
 
     joints: Pose
@@ -115,19 +115,19 @@ class PlannedPose:
 
 
 @dataclass(frozen=True)
-class Run:
-    """The session of one prism.
+class PrismRun:
+    """The part of a job for one prism: one session.
 
     Attributes:
-        prism, kind: of the session.
-        steps: in their order.
-        most: poses that are planned at most.
+        prism, kind: prism and kind of the session.
+        steps: steps in order.
+        most: maximum number of planned poses.
         poses: None until they are chosen.
-        session: "" until it is open.
-        last: number of the newest observation of the standstill that was measured last, or before the session.
-        label: of that standstill.
-        enough: why it is enough; "" while it is not.
-        least: poses that must be done before the stop rule is asked again.
+        session: session ID; "" until the session is open.
+        last: number of the newest observation of the last measured standstill, or of the newest before the session.
+        label: label of that standstill.
+        enough: why there are enough poses; "" while there are not.
+        least: poses that must be done before the stop rule applies again.
     """
 
     prism: str
@@ -148,13 +148,13 @@ class Run:
 
     @property
     def following(self) -> Step | None:
-        """The step after the one to do; None where there is none."""
+        """The step after the one to do; None if there is none."""
         number = self.next_step
         return None if number is None or number + 1 >= len(self.steps) else self.steps[number + 1]
 
     @property
     def next_pose(self) -> int | None:
-        """Index of the pose to go to; None where none is left or they are not chosen."""
+        """Index of the pose to go to; None if none is left or poses are not chosen yet."""
         return next((i for i, pose in enumerate(self.poses or ()) if pose.state == "to do"), None)
 
     @property
@@ -163,7 +163,7 @@ class Run:
         return sum(pose.state == "done" for pose in self.poses or ())
 
     def upcoming(self, count: int) -> list[Pose]:
-        """The next poses to measure."""
+        """Return at most `count` of the next poses to measure."""
         return [pose.joints for pose in self.poses or () if pose.state == "to do"][:count]
 
 
@@ -172,16 +172,16 @@ class Job:
     """The state of a guide.
 
     Attributes:
-        request: what it was asked for.
-        runs: in their order.
+        request: the requested job.
+        runs: runs in order.
         state: open, finished or abandoned.
-        misclosure_mm: of the newest shot.
-        trouble: why the last attempt at this step failed; "" after it went on.
-        ended_because: why it was abandoned.
+        misclosure_mm: misclosure of the newest shot, if any.
+        trouble: why the last attempt at this step failed; "" after the next event.
+        ended_because: why the guide was abandoned.
     """
 
     request: Request
-    runs: tuple[Run, ...]
+    runs: tuple[PrismRun, ...]
     state: Literal["open", "finished", "abandoned"] = "open"
     misclosure_mm: float | None = None
     trouble: str = ""
@@ -189,7 +189,7 @@ class Job:
 
     @classmethod
     def of(cls, request: Request) -> Job:
-        """A job of which nothing is done."""
+        """Return a job with nothing done."""
         wanted = [(prism, "static_poses", request.poses) for prism in request.prisms]
         if request.check_poses:
             wanted.append((request.prisms[-1], CHECK, request.check_poses))
@@ -197,24 +197,24 @@ class Job:
 
     @property
     def at(self) -> int:
-        """Index of the run that is on; the last one where all are over."""
+        """Index of the current run; of the last run if all are over."""
         left = (i for i, run in enumerate(self.runs) if run.next_step is not None)
         return next(left, len(self.runs) - 1)
 
     @property
-    def run(self) -> Run:
-        """The run that is on."""
+    def run(self) -> PrismRun:
+        """The current run."""
         return self.runs[self.at]
 
     @property
     def step(self) -> Step | None:
-        """The step to do; None where the job is over."""
+        """The step to do; None if the job is over."""
         number = self.run.next_step if self.state == "open" else None
         return None if number is None else self.run.steps[number]
 
     @property
     def step_id(self) -> str:
-        """Another text for every step, and for every pose."""
+        """Identifier that differs between all steps and all poses."""
         run = self.run
         if self.state != "open" or run.next_step is None:
             return self.state
@@ -225,13 +225,13 @@ class Job:
 
     @property
     def is_enough(self) -> bool:
-        """Return True if no pose is to be measured: the stop rule says so, or none is left."""
+        """Return True if no pose is to be measured: the stop rule found enough, or none is left."""
         run = self.run
         return bool(run.enough) or (run.poses is not None and run.next_pose is None)
 
     @property
     def sessions(self) -> tuple[str, ...]:
-        """Sessions of its runs, oldest first."""
+        """Sessions of the runs, oldest first."""
         return tuple(run.session for run in self.runs if run.session)
 
     # ---- events ------------------------------------------------------------------------------------------------------
@@ -240,7 +240,7 @@ class Job:
         """Return the state after an event.
 
         Raises:
-            ValueError: it cannot have happened in this state.
+            ValueError: the event cannot happen in this state.
         """
         if self.state != "open":
             raise ValueError(f"{kind}: the guide is {self.state}")
@@ -252,11 +252,11 @@ class Job:
         return _EVENTS[kind](replace(self, trouble=""), details)
 
     def skipped(self, reason: str, *, rest: bool) -> Job:
-        """Return the state without this step, or without all poses of the run that are left."""
+        """Return the state with this step skipped, or with all remaining poses of the run skipped."""
         run, step = self.run, self.step
         if step is None:
             raise ValueError("there is no step to skip")
-        if step.kind == "change_prism":  # without its prism the session has nothing
+        if step.kind == "change_prism":  # without its prism the session has no data
             steps = tuple(replace(s, state="skipped", reason=reason) if s.state == "to do" else s for s in run.steps)
             return self._with(replace(run, steps=steps))
         if step.kind != "poses":
@@ -266,26 +266,26 @@ class Job:
         return self._with(_posed(run, "skipped", reason))
 
     def changed(self, **changes: Any) -> Job:
-        """Return the state with other attributes of the run that is on."""
+        """Return the state with changed attributes of the current run."""
         return self._with(replace(self.run, **changes))
 
     def stepped(self) -> Job:
         """Return the state with this step done."""
         return self._with(_stepped(self.run, "done"))
 
-    def _with(self, run: Run) -> Job:
-        """Return the job with its present run changed; finished when that was the last thing to do."""
+    def _with(self, run: PrismRun) -> Job:
+        """Return the job with its current run replaced; the job is finished if no step is left."""
         at = self.at
         runs = (*self.runs[:at], run, *self.runs[at + 1 :])
         is_over = all(r.next_step is None for r in runs)
         return replace(self, runs=runs, state="finished" if is_over else "open")
 
 
-def _run(number: int, prism: str, kind: str, most: int, request: Request) -> Run:
-    # There and back: the point that a session ends with is the one that the next begins with.
+def _run(number: int, prism: str, kind: str, most: int, request: Request) -> PrismRun:
+    # The order alternates: a session begins with the control point that the previous session ended with.
     points = request.control_points[:: -1 if number % 2 else 1]
     planned = request.planned(prism) if kind != CHECK else None
-    return Run(
+    return PrismRun(
         prism,
         kind,
         (
@@ -300,14 +300,14 @@ def _run(number: int, prism: str, kind: str, most: int, request: Request) -> Run
     )
 
 
-def _stepped(run: Run, state: State, reason: str = "") -> Run:
+def _stepped(run: PrismRun, state: State, reason: str = "") -> PrismRun:
     number = run.next_step
     assert number is not None
     step = replace(run.steps[number], state=state, reason=reason)
     return replace(run, steps=(*run.steps[:number], step, *run.steps[number + 1 :]))
 
 
-def _posed(run: Run, state: State, reason: str = "") -> Run:
+def _posed(run: PrismRun, state: State, reason: str = "") -> PrismRun:
     number = run.next_pose
     if number is None or run.poses is None:
         raise ValueError("no pose is left")
@@ -315,7 +315,7 @@ def _posed(run: Run, state: State, reason: str = "") -> Run:
     return replace(run, poses=(*run.poses[:number], pose, *run.poses[number + 1 :]))
 
 
-def _rest_skipped(run: Run, reason: str) -> Run:
+def _rest_skipped(run: PrismRun, reason: str) -> PrismRun:
     poses = tuple(
         replace(pose, state="skipped", reason=reason) if pose.state == "to do" else pose for pose in run.poses or ()
     )
@@ -328,7 +328,7 @@ def _measured(job: Job, details: Mapping[str, Any]) -> Job:
 
 
 def _more(job: Job, details: Mapping[str, Any]) -> Job:
-    """Measure the poses that are left and new ones; the stop rule is not asked until they are done."""
+    """Add new poses to the remaining ones; the stop rule does not apply until all are done."""
     poses = (*(job.run.poses or ()), *(PlannedPose(pose) for pose in details["poses"]))
     least = sum(pose.state != "skipped" for pose in poses)
     return job.changed(poses=poses, enough="", least=least)
@@ -363,8 +363,8 @@ _EVENTS: Mapping[str, Callable[[Job, Mapping[str, Any]], Job]] = {
 }
 
 
-def pose_reasons(run: Run) -> Iterator[dict[str, Any]]:
-    """Yield number and reason of the poses that were skipped."""
+def pose_reasons(run: PrismRun) -> Iterator[dict[str, Any]]:
+    """Yield number and reason of each skipped pose."""
     for number, pose in enumerate(run.poses or (), start=1):
         if pose.state == "skipped":
             yield {"pose": number, "reason": pose.reason}

@@ -1,7 +1,7 @@
-"""Keeps the one open guide: takes the operator's commands, and tells how it goes.
+"""Manages the one open guide: handles the operator's commands and reports the state.
 
-What the job is and what comes next is `job`; the commands here make its events, and so does the guide's own thread
-(`worker`). Methods named `*_command` are called by the control socket's threads, `on_records` by the writer's.
+`job` defines the job and its next step. The commands here and the guide's thread (`worker`) create its events. The
+control socket's threads call the methods named `*_command`; the writer's thread calls `on_records`.
 """
 
 from __future__ import annotations
@@ -31,21 +31,20 @@ MORE_POSES = 5
 
 
 class GuideManager:
-    """Keeps the one open guide of a rig.
+    """Manages the one open guide of a rig.
 
     Args:
         rig: the machine.
-        store: where everything is kept.
-        sessions: opens, shoots in and closes sessions.
+        store: the database.
+        sessions: opens and closes sessions, and shoots control points in them.
         setups: the station set-ups.
-        joiner: what is known of the joints.
+        joiner: source of joint readings.
         clock: time.
-        meter_place: tells where the gain meter finds everything.
-        model: the candidate that awaits, for a guide that is finished.
+        meter_place: returns the locations of the gain meter's input.
+        model: returns the candidate model that awaits a decision, for a finished guide.
         settle_s: how long the boom must stand at a pose.
-        has_aim: something turns the station without an operator.
-        drive: has the boom go to the rows of a pose plan, where something can without an operator; None where nothing
-            can.
+        has_aim: True if the station is turned without an operator.
+        drive: sends the boom to the rows of a pose plan without an operator; None if nothing can.
     """
 
     def __init__(
@@ -72,25 +71,25 @@ class GuideManager:
         store.unless_damaged(self._course.restore, None)
 
     def start(self) -> None:
-        """Begin to look."""
+        """Start the guide's thread."""
         self._worker.start()
 
     def stop(self) -> None:
-        """Look no more; an open guide goes on with the next start of the daemon."""
+        """Stop the guide's thread; an open guide is resumed at the next start of the daemon."""
         self._worker.stop()
         self._course.advisor.close()
 
     def on_records(self, records: Sequence[Record]) -> None:
-        """Note where boom and station are; costs nothing while no guide is open."""
+        """Update the positions of boom and station; does nothing while no guide is open."""
         if self._record.is_open:
             self._course.watch.on_records(records)
 
     def guarding(self, name: str, handler: Handler) -> Handler:
-        """Return a command that is refused while a guide is open, which holds its sessions itself."""
+        """Wrap a command so that it is refused while a guide is open, because the guide runs its own sessions."""
 
         def guarded(arguments: Mapping[str, Any]) -> Any:
-            self._require_none_open(name)  # at once: the guide may have the turn for long, for a shot
-            with self._sessions.turn:  # which a guide takes, too, to be opened
+            self._require_none_open(name)  # before taking the turn, which the guide may hold for a whole shot
+            with self._sessions.turn:  # opening a guide takes this turn, too
                 self._require_none_open(name)
                 return handler(arguments)
 
@@ -101,9 +100,9 @@ class GuideManager:
         if opened is not None:
             row, job = opened
             raise CommandError(
-                f"{name} is not carried out: guide {row.id} is open and opens, shoots in and closes its sessions "
-                f"itself; next: {headline(job)} (`rigcal session guide` leads, and `rigcal session guide --stop "
-                "REASON` abandons it)",
+                f"{name} is refused: guide {row.id} is open and runs its sessions itself; its next step is: "
+                f"{headline(job)} (`rigcal session guide` continues it, `rigcal session guide --stop REASON` abandons "
+                "it)",
                 REFUSED,
             )
 
@@ -115,11 +114,11 @@ class GuideManager:
             guide = self._record.opened()
             if guide is not None:
                 raise CommandError(
-                    f"guide {guide[0].id} is open: {headline(guide[1])}; `rigcal session guide` goes on with it, and "
+                    f"guide {guide[0].id} is open: {headline(guide[1])}; `rigcal session guide` continues it, and "
                     "`rigcal session guide --stop REASON` abandons it",
                     REFUSED,
                 )
-            self._require_no_session()  # at once: a command about it may have the turn for long, for a shot
+            self._require_no_session()  # before taking the turn, which a command may hold for a whole shot
             described = mapping_argument(arguments, "new_setup")
             operator = text_argument(arguments, "operator")
             is_new = "new_setup" in arguments
@@ -149,13 +148,13 @@ class GuideManager:
         return self._state()
 
     def done_command(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
-        """Take the operator's word that the step is carried out."""
+        """Handle the operator's confirmation that the step is carried out."""
         with self._record.turn:
             job, step_id = self._record.needs_step(arguments)
             step, run = job.step, job.run
             assert step is not None
             if self._worker.busy == step_id or not run.session:
-                raise CommandError(f"the daemon is at work on it: {headline(job)}", REFUSED)
+                raise CommandError(f"the daemon is carrying out this step: {headline(job)}", REFUSED)
             with self._course.at_once():
                 self._record.tapped()
                 if step.kind == "change_prism":
@@ -165,13 +164,13 @@ class GuideManager:
                 elif step.kind == "poses" and run.next_pose is not None:
                     self._measured_here()
                 elif step.kind != "shoot_control_point":
-                    raise CommandError(f"this step ends by itself: {headline(job)}", REFUSED)
+                    raise CommandError(f"this step ends automatically: {headline(job)}", REFUSED)
             if step.kind == "shoot_control_point":
-                self._worker.wanted = step_id  # measured by the guide's own thread: the state shows how it goes
+                self._worker.wanted = step_id  # the guide's thread measures it; the state shows the progress
             return self._state()
 
     def skip_command(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
-        """Leave out the step, or all poses of the prism that are left, for a reason that is kept."""
+        """Skip the step, or all remaining poses of the prism; the reason is stored."""
         reason, rest = _reason(arguments), arguments.get("rest", False)
         if not isinstance(rest, bool):
             raise CommandError(f"rest must be true or false, not {rest!r:.80}")
@@ -191,13 +190,13 @@ class GuideManager:
             return self._state()
 
     def more_command(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
-        """Measure more poses of this prism although it is enough."""
+        """Measure more poses of this prism although there are enough."""
         count = whole_argument(arguments, "poses", MORE_POSES, 1, 100)
         with self._record.turn:
             job, _ = self._record.needs_step(arguments)
             step, run = job.step, job.run
             if step is None or step.kind != "poses" or not job.is_enough:
-                raise CommandError(f"more poses are for when there are enough; now: {headline(job)}", REFUSED)
+                raise CommandError(f"more poses can be added once there are enough; now: {headline(job)}", REFUSED)
             if self._course.is_choosing:
                 raise CommandError("more poses are being chosen already", REFUSED)
             left = len(run.upcoming(count))
@@ -222,7 +221,7 @@ class GuideManager:
             return self._state()
 
     def _measured_here(self) -> None:
-        """Take the standstill at which the boom is for the pose, wherever that is."""
+        """Accept the present standstill for the pose, wherever the boom is."""
         found, boom = self._course.standstill, self._course.watch.boom()
         here = (
             found is not None
@@ -232,7 +231,7 @@ class GuideManager:
         if found is None or not here or found.fixes < NEEDED_FIXES:
             raise CommandError(
                 f"{found.fixes if found is not None and here else 0} of {NEEDED_FIXES} fixes count at this standstill; "
-                "let the boom stand, with the station on the prism",
+                "keep the boom still, with the station on the prism",
                 REFUSED,
             )
         self._course.happen("measured", {"pose": found.pose, "last": found.last})
@@ -284,7 +283,7 @@ class GuideManager:
         return found
 
     def _unused_fixes(self, job: Job) -> list[str]:
-        """Why fixes that were measured since the boom has settled do not count, while a pose is to be measured."""
+        """Return why fixes since the boom has settled do not count, while a pose is to be measured."""
         step, stands_s = job.step, self._course.watch.boom().stands_s
         if step is None or step.kind != "poses" or job.run.poses is None or job.is_enough:
             return []
@@ -294,7 +293,7 @@ class GuideManager:
         reason = self._sessions.not_counting(min(FRESH_S, settled_s))
         if reason is None:
             return []
-        # Others are of the joints or the computer, where aiming helps nothing.
+        # Other reasons concern the joints or the computer, where aiming does not help.
         question = f"; is the station on prism {job.run.prism}?" if "prism" in reason else ""
         return [f"the fixes do not count: {reason}{question}"]
 
@@ -302,5 +301,5 @@ class GuideManager:
 def _reason(arguments: Mapping[str, Any]) -> str:
     reason = text_argument(arguments, "reason").strip()
     if not reason:
-        raise CommandError("say why: a reason is kept with what is left out")
+        raise CommandError("give a reason: it is stored with what is skipped")
     return reason

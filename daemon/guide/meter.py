@@ -1,13 +1,13 @@
-"""The gain meter: a process of its own that fits what is measured and says what to expect. `meter_link` starts it.
+"""The gain meter: a separate process that fits the measurements and predicts accuracy. `meter_link` starts it.
 
-Standard input carries questions, one JSON object a line, and standard output the answers; when the input closes, the
-daemon is gone and so goes the process. The first line is a `Place`. A question is
+It reads questions from standard input, one JSON object per line, and writes the answers to standard output. It exits
+when the input closes, because the daemon has then ended. The first line is a `Place`. A question is
 
     {"do": "assess", ..., "prisms": [NAME, ...], "next": [pose, ...]}
     {"do": "choose", ..., "count": 20, "seed": 3, "evenly": false}
 
-each with `sessions` to use, the one of them that is still open (`session`), `setup` and `prism`, and poses as joint ->
-number; an answer is {"result": {...}} or {"error": "one sentence"}. Only the daemon writes to the store.
+each with the `sessions` to use, the session that is still open (`session`), `setup` and `prism`. A pose maps joint ->
+number. An answer is {"result": {...}} or {"error": "one sentence"}. Only the daemon writes to the store.
 """
 
 from __future__ import annotations
@@ -50,15 +50,15 @@ from daemon.warm_up import prepare
 
 log = logging.getLogger(__name__)
 
-MOST_FIXES = 20  # of a standstill: its readings' errors, common to all, are then most of what is left
-_DIGITS = 3  # of joints in a pose
+MOST_FIXES = 20  # per standstill: with more, the joint readings' errors, common to all its fixes, dominate
+_DIGITS = 3  # decimals of joint values in a pose
 
 
 class Meter:
-    """Answers questions about what is measured.
+    """Answers questions about the measurements so far.
 
     Args:
-        place: where the store and the live model are.
+        place: locations of the store and the live model.
     """
 
     def __init__(self, place: Place) -> None:
@@ -68,21 +68,21 @@ class Meter:
         self._lacking = self._known_to_lack()
 
     def _known_to_lack(self) -> float:
-        """Return the errors that the live model leaves, which the next model is taken to leave as well."""
+        """Return the scale of the joint errors that the live model leaves; the next model is assumed to leave them."""
         if self._place.live_model is None:
             return 0.0
         try:
             sha256 = str(self._place.live_sha256)
             return read_model_of_rig(Path(self._place.live_model), sha256, self._rig).joint_error_scale
         except (CalibrationError, OSError) as error:
-            log.warning("the live model tells nothing of what a model lacks: %s", error)
+            log.warning("the errors that the live model leaves are unknown: %s", error)
             return 0.0
 
     def answer(self, question: Mapping[str, Any]) -> dict[str, Any]:
         """Answer a question.
 
         Raises:
-            CalibrationError, StoreError: in a sentence, why not.
+            CalibrationError, StoreError: there is no answer; the message gives the reason in one sentence.
         """
         rows = self._rows(question["sessions"], question["session"])
         try:
@@ -106,10 +106,10 @@ class Meter:
         found: dict[str, Any] = {
             "coverage": self._coverage(measured, rows, prism),
             "basis": self._basis(rows),
-            "least_poses": math.ceil(len(measured.knowledge.chain) / 3),  # with fewer a calibration is refused
+            "least_poses": math.ceil(len(measured.knowledge.chain) / 3),  # a calibration with fewer is refused
         }
         if not measured.is_placed:
-            why = f"where the station stands is known after {LEAST_POSES} poses; until then there is no number"
+            why = f"the station's place is known after {LEAST_POSES} poses; there is no estimate before"
             return (
                 found
                 | dict.fromkeys(("now_mm", "after_next_mm", "after_5_mm", "prism_mm", "prism_after_5_mm"))
@@ -129,7 +129,7 @@ class Meter:
         }
 
     def _ahead(self, measured: Measured, prism: str, planned: Sequence[Mapping[str, float]]) -> Floats:
-        """The next poses as planned, and where fewer than five are left some drawn evenly."""
+        """Return the next five poses: the planned ones, then evenly drawn ones if fewer than five are planned."""
         ahead = np.array([[pose[name] for name in self._rig.joint_names] for pose in planned[:FORECAST]])
         ahead = ahead.reshape(-1, len(self._rig.joints))
         more = FORECAST - len(ahead)
@@ -161,13 +161,13 @@ class Meter:
         sessions = sorted(set(rows.session.tolist()))
         text = f"build tolerances and {len(rows)} fixes of {len(sessions)} session{'s' if len(sessions) > 1 else ''}"
         if self._lacking:
-            return f"{text}; a new model is taken to leave the errors that the live one does"
-        return f"{text}; errors that a model of the geometry cannot say, such as droop, are in it only as scatter"
+            return f"{text}; a new model is assumed to leave the same errors as the live one"
+        return f"{text}; errors that a geometric model cannot describe, such as droop, count only as scatter"
 
     # ---- rows --------------------------------------------------------------------------------------------------------
 
     def _rows(self, sessions: Sequence[str], still_open: str) -> Observations | None:
-        """Observations of all sessions that count; closed ones are read once."""
+        """Return the observations of all given sessions; closed sessions are read once."""
         found = []
         with Reader(Path(self._place.store), self._identity()) as reader:
             for name in sessions:
@@ -180,7 +180,7 @@ class Meter:
 
     def _read(self, reader: Reader, session: str) -> Observations | None:
         data = sessions_csv(reader, self._rig, [session])
-        if data.count(b"\n") < 2:  # a header alone
+        if data.count(b"\n") < 2:  # only a header
             return None
         return thinned(parse_observations(data, self._rig, f"session {session}"))
 
@@ -192,7 +192,7 @@ class Meter:
 
 
 def thinned(rows: Observations) -> Observations:
-    """Keep as many fixes of every standstill as tell nearly all, spread over it: the meter must not slow down."""
+    """Keep at most `MOST_FIXES` fixes of every standstill, spread evenly over it, so that the meter stays fast."""
     _, standstill = np.unique(rows.pose, return_inverse=True)
     kept = np.zeros(len(rows), dtype=bool)
     for number in range(standstill.max(initial=-1) + 1):
@@ -202,7 +202,7 @@ def thinned(rows: Observations) -> Observations:
 
 
 def joined(parts: Sequence[Observations]) -> Observations:
-    """Rows of several sessions after each other, with the optional columns that all of them have."""
+    """Concatenate the rows of several sessions, with the optional columns that all of them have."""
     columns = set.intersection(*(set(part.extra) for part in parts))
 
     def joined(name: str) -> Any:
@@ -219,11 +219,11 @@ def joined(parts: Sequence[Observations]) -> Observations:
 
 
 def main() -> int:
-    """Entry of the process: exit status 0 when the daemon needs it no more."""
+    """Run the process; return exit status 0 once the daemon closes standard input."""
     line = sys.stdin.readline()
     if not line:
         return 0
-    set_up_logging(is_prefixed=True)  # the daemon reads standard error, and logs it
+    set_up_logging(is_prefixed=True)  # the daemon logs what it reads from standard error
     tell = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # a library that prints must not break the protocol
     meter = Meter(Place.from_line(line))
@@ -236,7 +236,7 @@ def main() -> int:
             answer = {"error": str(error)}
         except Exception as error:
             log.error("the gain meter failed", exc_info=error)
-            answer = {"error": f"{type(error).__name__}: {error}; the daemon's log has the whole story"}
+            answer = {"error": f"{type(error).__name__}: {error}; see the daemon's log for details"}
         tell.write(json.dumps(answer) + "\n")
         tell.flush()
     return 0

@@ -1,4 +1,4 @@
-"""The gain meter's process, seen from the daemon: started with the guide, asked, ended with it."""
+"""The daemon's link to the gain meter's process, which starts and ends with the guide."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from daemon.store.store import Store
 
 log = logging.getLogger(__name__)
 
-# -P keeps the current directory off the process's path: what lies there is no code of ours.
+# -P keeps the current directory, which holds no code of rigcal, off the module path.
 METER_COMMAND = (sys.executable, "-P", "-m", "daemon.guide.meter")
 MAX_LOGGED_BYTES = 4096
 
@@ -29,7 +29,7 @@ Answer = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class Place:
-    """Place where the meter finds everything.
+    """Locations of the gain meter's input.
 
     Attributes:
         store: the database.
@@ -50,13 +50,13 @@ class Place:
 
     @classmethod
     def from_line(cls, line: str) -> Place:
-        """Return the place in a line that `to_line` made."""
+        """Read a line that `to_line` made."""
         place = json.loads(line)
         return cls(**place | {"store_file": place["store_file"] and tuple(place["store_file"])})
 
     @classmethod
     def of(cls, store: Store, rig_text: str, live: ModelRow | None) -> Place:
-        """The place of a store that the daemon has open."""
+        """Return the locations for a store that the daemon has open."""
         file = store.files.database
         return cls(
             str(store.path),
@@ -68,16 +68,16 @@ class Place:
 
 
 class MeterLink:
-    """The process that says what is still to gain; one question at a time, of two alike that wait the newer one.
+    """The process that estimates the remaining gain; it answers one question at a time.
 
     Args:
-        place: where it finds everything.
+        place: locations of its input.
 
     Attributes:
-        pid: of the process.
+        pid: ID of the process.
 
     Raises:
-        OSError: it cannot be started.
+        OSError: the process cannot be started.
     """
 
     def __init__(self, place: Place) -> None:
@@ -94,13 +94,18 @@ class MeterLink:
         threading.Thread(target=self._log, name="gain-meter-log", daemon=True).start()
 
     def ask(self, question: Mapping[str, Any], take: Callable[[Answer], None]) -> None:
-        """Ask; `take` is called with the answer in another thread. A like question that waits is given up for it."""
+        """Queue a question; it replaces a pending question of the same kind.
+
+        Args:
+            question: the question, as described in `meter`.
+            take: called with the answer in a different thread.
+        """
         with self._asked:
             self._waiting[question["do"]] = question, take
             self._asked.notify_all()
 
     def close(self) -> None:
-        """End the process; an answer that is under way is not waited for."""
+        """End the process without waiting for a pending answer."""
         with self._asked:
             self._is_closing = True
             self._asked.notify_all()
@@ -115,7 +120,7 @@ class MeterLink:
     def _work(self) -> None:
         assert self._process.stdin is not None
         assert self._process.stdout is not None
-        # What breaks a pipe is the end of the process: `is_alive` tells, and the guide starts another one.
+        # A pipe breaks when the process ends: `is_alive` is then False, and the guide restarts the process.
         with contextlib.suppress(OSError), self._process.stdout as answers, self._process.stdin as questions:
             questions.write(self._order)
             questions.flush()
@@ -127,12 +132,12 @@ class MeterLink:
                 if self._is_closing:
                     return
                 if not answer.endswith(b"\n"):
-                    take({"error": "the process of the gain meter has ended; it is started again"})
+                    take({"error": "the gain meter's process has ended; it is being restarted"})
                     return
                 take(json.loads(answer))
 
     def _next(self) -> tuple[Mapping[str, Any], Callable[[Answer], None]] | None:
-        """Wait for a question; None when there will be none."""
+        """Wait for a question; return None once the link closes."""
         with self._asked:
             self._asked.wait_for(lambda: self._waiting or self._is_closing)
             return None if self._is_closing else self._waiting.pop(next(iter(self._waiting)))

@@ -1,4 +1,4 @@
-"""Positions of boom and station, as a guide sees them: joints against a pose, last fixes against control points."""
+"""Positions of boom and station for a guide: joints compared with a pose, last fixes with control points."""
 
 from __future__ import annotations
 
@@ -21,23 +21,23 @@ from drivers.clock import NS_PER_S, Clock
 from drivers.readings import Fix, Record
 from drivers.stations.survey import position_mm
 
-TOLERANCE = 0.03  # of a joint's range: a pose as near as that tells nearly as much as the planned one
+TOLERANCE = 0.03  # of a joint's range: a pose this close gives nearly as much information as the planned one
 FRESH_S = 1.0  # readings older than this are not shown as live
-_RECOGNISED = 3  # fixes at a control point
-_TOGETHER_MM = 20.0  # of them: the station stands
+_RECOGNISED = 3  # fixes by which a control point is recognised
+_TOGETHER_MM = 20.0  # greatest distance between them for a standing target
 _MOVING_S = 0.2
 
 
 @dataclass(frozen=True)
 class BoomPosition:
-    """The joints now.
+    """The present joint readings.
 
     Attributes:
-        values: joint -> reading, deg or mm; empty before all were read.
-        age_s: of these readings; None before.
+        values: joint -> reading, deg or mm; empty until all joints were read.
+        age_s: age of these readings; None if there are none.
         stands_s: for how long the boom has stood; None while it moves.
-        is_fresh: whether they are live.
-        missing: why there are none, a clause; "" where there are, and where they are waited for.
+        is_fresh: whether the readings are live.
+        missing: why there are no live readings, a clause; "" if there are or if they are still expected.
     """
 
     values: Mapping[str, float]
@@ -48,12 +48,12 @@ class BoomPosition:
 
 
 class PositionWatch:
-    """Keeps the newest joints and fixes. `on_records` runs in the writer's thread, the rest in any.
+    """Keeps the newest joints and fixes. `on_records` runs in the writer's thread, the other methods in any thread.
 
     Args:
         rig: the machine.
-        joiner: what is known of the joints.
-        clock: for ages.
+        joiner: source of joint readings.
+        clock: clock for the age of readings.
     """
 
     def __init__(self, rig: Rig, joiner: ObservationJoiner, clock: Clock) -> None:
@@ -62,30 +62,30 @@ class PositionWatch:
         self.begin()
 
     def begin(self) -> None:
-        """Look anew: what was seen before counts no more."""
+        """Start again; earlier readings and fixes no longer count."""
         self._state: MachineState | str | None = None
         self._began_ns = self._clock.now().monotonic_ns
         self._fixes.clear()
 
     def on_records(self, records: Sequence[Record]) -> None:
-        """Take records that the joiner knows already."""
+        """Process records that the joiner has already processed."""
         for record in records:
             if isinstance(record, Fix) and (place := position_mm(record)) is not None:
                 self._fixes.append((record.stamp.monotonic_ns, place))
         self._state = self._joiner.latest()
 
     def boom(self) -> BoomPosition:
-        """The joints now."""
+        """Return the present joint readings."""
         state, now = self._state, self._clock.now()
-        if state is None:  # nothing was read since it looks; readings come within a moment where they come at all
+        if state is None:  # nothing was read since `begin`; readings arrive within FRESH_S if at all
             waits = self._clock.real_seconds((now.monotonic_ns - self._began_ns) / NS_PER_S) <= FRESH_S
-            return BoomPosition({}, None, None, False, "" if waits else "no joint was read yet")
+            return BoomPosition({}, None, None, False, "" if waits else "no joint has been read yet")
         if isinstance(state, str):
             return BoomPosition({}, None, None, False, state)
         read = {joint.name: np.array([state.values[joint.column]]) for joint in self._rig.joints}
         values = {name: float(value[0]) for name, value in on_one_turn(self._rig, read).items()}
         if now.boot_id != state.boot_id:
-            return BoomPosition(values, None, None, False, "the joints were last read before the computer started anew")
+            return BoomPosition(values, None, None, False, "the joints were last read before the computer restarted")
         age_s = max(0.0, (now.monotonic_ns - state.monotonic_ns) / NS_PER_S)
         is_fresh = self._clock.real_seconds(age_s) <= FRESH_S
         stands_s = state.dwell_s if state.dwell_s is not None and state.dwell_s >= _MOVING_S else None
@@ -93,11 +93,11 @@ class PositionWatch:
         return BoomPosition(values, age_s, stands_s if is_fresh else None, is_fresh, missing)
 
     def forget_fixes(self) -> None:
-        """The station is turned to something else."""
+        """Discard the fixes, because the station is turned to a different target."""
         self._fixes.clear()
 
     def is_at(self, place_mm: Place | None) -> bool:
-        """Return True if the station's last fixes are of a standing target near a place, None for one not known."""
+        """Return True if the station's last fixes are of a standing target near a place; False for None."""
         fixes = [*self._fixes]
         if place_mm is None or len(fixes) < _RECOGNISED:
             return False
@@ -109,7 +109,7 @@ class PositionWatch:
 
 
 def tolerance(low: float, high: float) -> float:
-    """Return how far from its target a joint counts as there, of the limits of its range."""
+    """Return how far from its target a joint still counts as there, given the limits of its range."""
     return TOLERANCE * (high - low)
 
 
@@ -124,7 +124,13 @@ def joints_of(rig: Rig, standstill: Standstill) -> dict[str, float]:
 
 
 def joint_rows(rig: Rig, boom: BoomPosition, pose: Pose | None) -> list[dict[str, Any]]:
-    """Return where every joint is and where it should be, for JSON."""
+    """Return reading and target of every joint as JSON objects.
+
+    Args:
+        rig: the machine.
+        boom: present joint readings.
+        pose: target; None if there is none.
+    """
     rows = []
     for joint in rig.joints:
         now, target = boom.values.get(joint.name), None if pose is None else pose[joint.name]

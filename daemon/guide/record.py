@@ -1,4 +1,4 @@
-"""The newest guide of a rig as the store has it: every event is stored before it counts."""
+"""The newest guide of a rig in the store: every event is stored before it takes effect."""
 
 from __future__ import annotations
 
@@ -22,14 +22,15 @@ class GuideRecord:
     """The newest guide, open or not.
 
     Args:
-        store: where guides are kept.
-        rig_name: whose guides they are.
-        clock: for when something happened.
+        store: the database.
+        rig_name: name of the rig.
+        clock: clock for the timestamps of events.
 
     Attributes:
-        turn: held by whoever reads or changes several things at once.
-        row, job: of the newest guide; None before the first.
-        table: of all guides.
+        turn: lock to hold while several attributes are read or changed together.
+        row, job: row and job of the newest guide; None before the first.
+        taps: number of commands given to it.
+        table: table of all guides.
     """
 
     def __init__(self, store: Store, rig_name: str, clock: Clock) -> None:
@@ -47,29 +48,29 @@ class GuideRecord:
         return job is not None and job.state == "open"
 
     def opened(self) -> tuple[GuideRow, Job] | None:
-        """The open guide; None without one."""
+        """Return the open guide; None if there is none."""
         row, job = self.row, self.job
         return (row, job) if row is not None and job is not None and job.state == "open" else None
 
     def needs_step(self, arguments: Mapping[str, Any]) -> tuple[Job, str]:
-        """Return the job and its step; CommandError without an open guide, or where another `step` is meant."""
+        """Return the job and its step; CommandError without an open guide or if `step` names a different step."""
         job = self.job
         if job is None or job.state != "open":
             raise CommandError("no guide is open; `rigcal session guide --prisms w,b,r,s` starts one")
         meant = arguments.get("step")
         if meant is not None and meant != job.step_id:
-            raise CommandError(f"another step is on by now: {headline(job)}", REFUSED)
+            raise CommandError(f"the guide is now at a different step: {headline(job)}", REFUSED)
         return job, job.step_id
 
     def open(self, request: Request, setup_id: str, operator: str) -> None:
-        """Begin a guide."""
+        """Open a guide."""
         with self._store.transaction():
             self.table.open(self._clock.now(), setup_id, operator, request.as_dict(), **caller_columns())
             self._store.once_committed(partial(self._take, self.table.newest(), Job.of(request)))
             self._store.once_committed(partial(self._count, 1))
 
     def tapped(self) -> None:
-        """Count a command that is given to the guide."""
+        """Count a command given to the guide."""
         taps = self.taps + 1
         with self._store.transaction():
             if self.row is not None:
@@ -77,10 +78,15 @@ class GuideRecord:
             self._store.once_committed(partial(self._count, taps))
 
     def happen(self, kind: str, details: Mapping[str, Any], only_at: str = "") -> tuple[Job, Job] | None:
-        """Store an event, which counts once it is committed.
+        """Store an event, which takes effect once it is committed.
+
+        Args:
+            kind: kind of the event, as in `job`.
+            details: details of the event, as in `job`.
+            only_at: step at which the event must happen; "" for any.
 
         Returns:
-            The states before and after; None where another step than `only_at` is on by now.
+            The states before and after; None if the guide is not open or at a step other than `only_at`.
         """
         row, before = self.row, self.job
         if row is None or before is None or before.state != "open" or only_at not in ("", before.step_id):
@@ -102,7 +108,7 @@ class GuideRecord:
         self.taps = taps
 
     def restore(self) -> None:
-        """Read the guide that an earlier run of the daemon left."""
+        """Restore the guide that an earlier run of the daemon left."""
         row = self.table.newest()
         if row is None:
             return
@@ -111,10 +117,10 @@ class GuideRecord:
             job = job.after(event.kind, event.details)
         self.row, self.job, self.taps = row, job, row.taps
         if job.state == "open":
-            log.warning("guide %d was open when rigcal last ended; it goes on: %s", row.id, headline(job))
+            log.warning("guide %d was open when rigcal last ended; it continues: %s", row.id, headline(job))
 
     def times_away(self) -> Iterator[tuple[Stamp, Stamp | None]]:
-        """When the station was on no prism in the session that is on: since, and until where that is over."""
+        """Yield start and end of each time of the session with the station on no prism; the end is None if it lasts."""
         opened = self.opened()
         if opened is None or not opened[1].run.session:
             return

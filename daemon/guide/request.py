@@ -1,4 +1,4 @@
-"""Request of an operator for a guide: the arguments of `guide.start`, checked."""
+"""Validation of an operator's request for a guide, the arguments of `guide.start`."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ _SMALLEST_TARGET_MM = 1e-3
 
 
 def request_of(arguments: Mapping[str, Any], rig: Rig, known_points: Sequence[str]) -> Request:
-    """Return the job that is asked for.
+    """Return the requested job.
 
     Args:
-        arguments: of `guide.start`.
+        arguments: arguments of `guide.start`.
         rig: the machine.
         known_points: control points of the set-up.
 
     Raises:
-        CommandError: an argument is none.
+        CommandError: an argument is invalid.
     """
     plan = _plan(arguments.get("plan"), rig)
     if plan is not None and arguments.get("poses") is not None:
@@ -35,7 +35,7 @@ def request_of(arguments: Mapping[str, Any], rig: Rig, known_points: Sequence[st
     for point in points:
         identifier({"name": point}, "name", "a control point's name")
         if point in rig.prism_names:
-            raise CommandError(f"{point!r} is a prism of the rig; a control point stands still beside it")
+            raise CommandError(f"{point!r} is a prism of the rig; a control point stands still, away from the rig")
     if len(points) > _MOST_POINTS:
         raise CommandError(f"a set-up has at most {_MOST_POINTS} control points, not {len(points)}")
     prisms = _names(arguments, "prisms") or list(rig.prism_names)
@@ -44,7 +44,7 @@ def request_of(arguments: Mapping[str, Any], rig: Rig, known_points: Sequence[st
         raise CommandError(f"rig {rig.name!r} has no prism {unknown[0]!r:.80}; it has {', '.join(rig.prism_names)}")
     out_of_view = [prism for prism in prisms if plan is not None and not any(prism in seen for _, seen in plan)]
     if out_of_view:
-        raise CommandError(f"prism {out_of_view[0]} is in view in no pose of the plan")
+        raise CommandError(f"no pose of the plan has prism {out_of_view[0]} in view")
     target_mm = number_argument(arguments, "target_mm")
     if target_mm is not None and target_mm < _SMALLEST_TARGET_MM:
         raise CommandError(f"target_mm is {_SMALLEST_TARGET_MM:g} mm or more, not {target_mm:g}")
@@ -56,18 +56,18 @@ def request_of(arguments: Mapping[str, Any], rig: Rig, known_points: Sequence[st
 
 
 def misfit(job: Job, rig: Rig) -> str:
-    """Return why a job cannot go on with the rig as its file has it now, a clause; "" where it can."""
+    """Return why a job cannot continue with the present rig file, a clause; "" if it can."""
     prisms = sorted({run.prism for run in job.runs} - set(rig.prism_names))
     if prisms:
         return f"the rig file has changed: it has no prism {prisms[0]} any more"
     poses = [pose.joints for run in job.runs for pose in run.poses or ()]
     if any(set(pose) != set(rig.joint_names) for pose in poses):
-        return "the rig file has changed: the poses of this guide are of other joints"
+        return "the rig file has changed: the poses of this guide have different joints"
     return ""
 
 
 def whole_argument(arguments: Mapping[str, Any], key: str, default: int, least: int, most: int) -> int:
-    """Return the whole number that `arguments` gives under `key`; CommandError if it is none from `least` to `most`."""
+    """Return the whole number under `key`; CommandError unless it is one from `least` to `most`."""
     value = arguments.get(key)
     if value is None:
         return default
@@ -77,17 +77,17 @@ def whole_argument(arguments: Mapping[str, Any], key: str, default: int, least: 
 
 
 def _names(arguments: Mapping[str, Any], key: str) -> list[str]:
-    """Return a list of different texts, empty by default."""
+    """Return a list of distinct names, empty by default."""
     value = arguments.get(key) or []
     if not isinstance(value, list) or not all(isinstance(name, str) for name in value):
         raise CommandError(f"{key} must be a list of names, not {value!r:.80}")
     if len(set(value)) < len(value):
-        raise CommandError(f"{key} names one of them twice")
+        raise CommandError(f"{key} contains the same name twice")
     return value
 
 
 def _plan(rows: object, rig: Rig) -> tuple[tuple[Pose, tuple[str, ...]], ...] | None:
-    """Return poses with the prisms in view; None where no plan is given."""
+    """Return poses with the prisms in view; None if no plan is given."""
     if rows is None:
         return None
     if not isinstance(rows, list) or not 1 <= len(rows) <= MOST_POSES:

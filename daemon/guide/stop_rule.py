@@ -10,7 +10,7 @@ from daemon.guide.job import Job
 
 LEAST_POSES = 6  # of a prism
 WORTHWHILE = 0.05  # five more poses must lower the expected error by this share
-_MORE_THAN_NEEDED = 1.25  # poses, of those without which a calibration is refused
+_MORE_THAN_NEEDED = 1.25  # margin on the number of poses without which a calibration is refused
 
 
 @dataclass(frozen=True)
@@ -18,9 +18,9 @@ class Forecast:
     """Expected RMS 3-D error over the work volume, mm.
 
     Attributes:
-        now_mm: of all prisms measured so far.
-        prism_mm: of the prism that is measured, now.
-        prism_after_5_mm: of the same after five more poses.
+        now_mm: present error of all prisms measured so far.
+        prism_mm: present error of the prism that is being measured.
+        prism_after_5_mm: error of this prism after five more poses.
     """
 
     now_mm: float
@@ -29,10 +29,10 @@ class Forecast:
 
 
 def least_poses(job: Job, needed: int) -> int:
-    """Return how many poses of the prism are measured in any case.
+    """Return the minimum number of poses of the prism.
 
     Args:
-        job: of the guide; its operator may have asked for more.
+        job: job of the guide; its operator may have asked for more poses.
         needed: poses without which a calibration is refused; the sessions of a guide share them, with a margin.
     """
     sessions = sum(run.kind != CHECK for run in job.runs)
@@ -40,13 +40,13 @@ def least_poses(job: Job, needed: int) -> int:
 
 
 def stop_reason(forecast: Forecast, target_mm: float | None, done: int, least: int = LEAST_POSES) -> str:
-    """Return why it is enough, a sentence; "" where more poses are worthwhile.
+    """Return why there are enough poses, a clause; "" if more poses are worthwhile.
 
     Args:
-        forecast: what is expected.
-        target_mm: error at which it is enough; None where none was given.
-        done: poses of the prism.
-        least: poses that are measured in any case.
+        forecast: expected errors.
+        target_mm: error at which there are enough poses; None if none was given.
+        done: measured poses of the prism.
+        least: minimum number of poses.
     """
     if done < least:
         return ""
@@ -54,5 +54,5 @@ def stop_reason(forecast: Forecast, target_mm: float | None, done: int, least: i
         return f"the expected error, {forecast.prism_mm:.2g} mm, has reached the target of {target_mm:g} mm"
     gain = 1.0 - forecast.prism_after_5_mm / forecast.prism_mm
     if gain < WORTHWHILE:
-        return f"five more poses would lower the expected error of {forecast.prism_mm:.2g} mm by {gain:.0%} only"
+        return f"five more poses would lower the expected error of {forecast.prism_mm:.2g} mm by only {gain:.0%}"
     return ""

@@ -8,7 +8,7 @@ from typing import Any
 
 from calibration.rig.description import Rig
 from daemon.commands import CHECK
-from daemon.guide.job import Job, PlannedPose, Run, Step, pose_reasons
+from daemon.guide.job import Job, PlannedPose, PrismRun, Step, pose_reasons
 from daemon.guide.position import BoomPosition, is_there, joint_rows, joints_of
 from daemon.store.queries.guides import GuideRow, Standstill
 
@@ -17,19 +17,19 @@ _MORE = {"button": "Measure 5 more poses", "command": "guide.more", "arguments":
 
 @dataclass(frozen=True)
 class Around:
-    """A guide's surroundings: its state beside the job itself.
+    """State of a guide apart from its job.
 
     Attributes:
-        boom: the joints now.
-        standstill: the newest one of this pose whose observations count.
-        accuracy, coverage: the newest answer of the gain meter.
-        taps: commands given to the guide.
-        is_busy: the daemon is carrying the step out.
-        is_detected: the step ends by itself once it is done.
-        has_aim: something turns the station without an operator.
+        boom: present joint readings.
+        standstill: newest standstill of this pose whose observations count.
+        accuracy, coverage: newest answer of the gain meter.
+        taps: number of commands given to the guide.
+        is_busy: True while the daemon is carrying out the step.
+        is_detected: True if the step ends automatically once it is done.
+        has_aim: True if the station is turned without an operator.
         settle_s, needed_fixes: how long to stand at a pose, and how many fixes must count there.
         warnings: sentences.
-        model: the candidate that awaits; None before the guide is finished.
+        model: candidate model that awaits a decision; None before the guide is finished.
     """
 
     boom: BoomPosition
@@ -47,7 +47,14 @@ class Around:
 
 
 def state_of(rig: Rig, row: GuideRow, job: Job, around: Around) -> dict[str, Any]:
-    """Return the object under `guide` of the state."""
+    """Return the object under the key `guide` of the state.
+
+    Args:
+        rig: the machine.
+        row: stored row of the guide.
+        job: job of the guide.
+        around: state of the guide apart from its job.
+    """
     run = job.run if job.state == "open" else None
     pose = _target(job)
     return {
@@ -82,7 +89,7 @@ def headline(job: Job) -> str:
 
 
 def _target(job: Job) -> PlannedPose | None:
-    """The pose to go to; None at another step."""
+    """Return the pose to go to; None at other steps."""
     run = job.run
     if job.step is None or job.step.kind != "poses" or job.is_enough or run.next_pose is None or run.poses is None:
         return None
@@ -148,7 +155,7 @@ def _title(job: Job) -> str:
     step, run = job.step, job.run
     is_check = run.kind == CHECK
     if step is None:
-        return "All is measured" if job.state == "finished" else "The guide was abandoned"
+        return "Everything is measured" if job.state == "finished" else "The guide was abandoned"
     if step.kind != "poses":
         return {
             "shoot_control_point": f"Shoot control point {step.point}",
@@ -163,40 +170,40 @@ def _title(job: Job) -> str:
 
 
 def _words(job: Job, kind: str, around: Around) -> tuple[str, str]:
-    """Instruction and reason of a step."""
+    """Return instruction and reason of a step."""
     step, run = job.step, job.run
     point = step.point if step else ""
     if kind == "shoot_control_point" and step is not None:
-        by_itself = "; it is measured by itself" if around.is_detected else ", then say so"
+        by_itself = "; it is measured automatically" if around.is_detected else ", then confirm"
         when = "start" if step.phase == "start" else "end"
-        why = f"Only with a shot at its start and one at its end is it known that the station stood still ({when})."
+        why = f"Shots at the start and at the end of the session show that the station stood still ({when})."
         if around.is_busy:
             return f"Keep the station on control point {point}.", why
         return f"Aim the station at control point {point}{by_itself}.", why
     words = {
         "change_prism": (
-            f"Aim the station at prism {run.prism}, let it lock, and say so.",
-            "Fixes count from then on, as fixes of this prism."
-            + (" They are kept apart to judge the model." if run.kind == CHECK else ""),
+            f"Aim the station at prism {run.prism}, let it lock, then confirm.",
+            "From then on, fixes count as fixes of this prism."
+            + (" They are held out to judge the model." if run.kind == CHECK else ""),
         ),
         "planning": (
             "Wait; this takes a few seconds, the first time up to half a minute.",
-            "The poses follow from what is known by now.",
+            "The poses are chosen from the measurements so far.",
         ),
         "go_to_pose": (
-            "Move every joint to its target; the pose is measured by itself once the boom stands.",
-            "The check shows how far off the model is at poses it has never seen."
+            "Move every joint to its target; the pose is measured automatically once the boom stands.",
+            "The check shows the error of the model at poses it has never seen."
             if run.kind == CHECK
-            else "Of all poses in view this one adds most to what is known.",
+            else "Of all poses in view, this one adds most information.",
         ),
-        "hold": ("Stand still.", f"{around.needed_fixes} fixes at the standstill make the pose."),
+        "hold": ("Keep the boom still.", f"The pose is done after {around.needed_fixes} fixes at this standstill."),
         "enough": (
             _after_enough(job, around),
             (run.enough[:1].upper() + run.enough[1:] if run.enough else "All planned poses are done") + ".",
         ),
-        "close": ("Wait; the session is being closed.", "Its jobs follow by themselves."),
+        "close": ("Wait; the session is being closed.", "Its jobs then start automatically."),
         "finished": (_after_all(around.model), "Accept the model only if it is better on the check."),
-        "abandoned": (f"It was abandoned: {job.ended_because}.", "Start another guide when you are ready."),
+        "abandoned": (f"The guide was abandoned: {job.ended_because}.", "Start a new guide when you are ready."),
     }
     return words[kind]
 
@@ -206,26 +213,29 @@ def _after_enough(job: Job, around: Around) -> str:
     if step is None or step.kind != "shoot_control_point":
         return "Go on."
     if around.is_detected:
-        return f"Aim the station at control point {step.point}; it is measured by itself. Or measure five more poses."
+        return (
+            f"Aim the station at control point {step.point}, which is measured automatically. "
+            "Or measure five more poses."
+        )
     return f"Go on to control point {step.point}, or measure five more poses."
 
 
 def _after_all(model: Mapping[str, Any] | None) -> str:
     if model is None or (model["id"] is None and not model["jobs"]):
-        return "No model awaits; `rigcal jobs list` says what became of the jobs."
+        return "No model awaits a decision; `rigcal jobs list` shows the results of the jobs."
     if model["jobs"]:
         jobs = "1 job is" if model["jobs"] == 1 else f"{model['jobs']} jobs are"
-        return f"You may leave it: {jobs} still at work on the model; `rigcal jobs list` shows them."
+        return f"You may leave now: {jobs} still working on the model; `rigcal jobs list` shows them."
     if model["is_acceptable"]:
-        return f"Model {model['id']} awaits: `rigcal model accept {model['id']}` makes it live."
-    return f"Model {model['id']} awaits and would be refused: {model['refused_because']}"
+        return f"Model {model['id']} awaits a decision: `rigcal model accept {model['id']}` makes it live."
+    return f"Model {model['id']} awaits a decision, but would be refused: {model['refused_because']}"
 
 
 # ---- parts -----------------------------------------------------------------------------------------------------------
 
 
 def _hold(rig: Rig, pose: PlannedPose, around: Around) -> dict[str, Any]:
-    """Progress at a pose; fixes of a standstill elsewhere are none of its."""
+    """Return the progress at a pose; fixes of a standstill elsewhere do not count."""
     found = around.standstill
     fixes = found.fixes if found is not None and is_there(rig, joints_of(rig, found), pose.joints) else 0
     return {
@@ -236,7 +246,7 @@ def _hold(rig: Rig, pose: PlannedPose, around: Around) -> dict[str, Any]:
     }
 
 
-def _counts(run: Run) -> dict[str, int]:
+def _counts(run: PrismRun) -> dict[str, int]:
     poses = run.poses
     return {
         "done": run.done,
@@ -268,7 +278,7 @@ def _steps(job: Job) -> list[dict[str, Any]]:
     return rows
 
 
-def _row_title(run: Run, step: Step) -> str:
+def _row_title(run: PrismRun, step: Step) -> str:
     what = "the check" if run.kind == CHECK else f"prism {run.prism}"
     match step.kind:
         case "shoot_control_point":
@@ -288,8 +298,8 @@ def _messages(job: Job, around: Around) -> list[dict[str, str]]:
     skipped = [s for s in run.steps if s.kind == "shoot_control_point" and s.state == "skipped"]
     if job.state == "open" and skipped:
         text = (
-            f"control point {skipped[0].point} was skipped ({skipped[0].reason}): unless another one is shot at both "
-            "ends, the session is not used until an operator accepts it"
+            f"control point {skipped[0].point} was skipped ({skipped[0].reason}): unless a different one is shot at "
+            "both ends, the session is not used until an operator accepts it"
         )
         found.append({"severity": "note", "text": text})
     return found

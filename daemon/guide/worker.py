@@ -1,6 +1,6 @@
-"""The guide's own thread: sees ten times a second what is done, and does by itself what needs no operator.
+"""The guide's thread: checks the progress ten times per second and carries out the steps that need no operator.
 
-It opens, shoots in and closes sessions, and has a simulated boom go to the poses.
+It opens and closes sessions, shoots control points in them, and sends a simulated boom to the poses.
 """
 
 from __future__ import annotations
@@ -28,29 +28,29 @@ log = logging.getLogger(__name__)
 TICK_S = 0.1
 NEEDED_FIXES = 5  # at a pose
 _CANCEL_S = 5.0
-_STANDS_S = 20.0  # of a simulated boom at a pose that it was sent to
+_STANDS_S = 20.0  # for which a simulated boom stands at each pose
 _SENT_AGAIN_S = 120.0
 _MOVED = "the station has moved, its control points no longer fit: the next guide needs a new set-up"
 
 Drive = Callable[[Sequence[Mapping[str, Any]]], int]
-"""Has the boom go to the rows of a pose plan; returns how many stops are to come."""
+"""Sends the boom to the rows of a pose plan; returns the number of remaining stops."""
 
 
 class GuideWorker:
-    """Carries the open guide on.
+    """Advances the open guide.
 
     Args:
         rig: the machine.
-        course: of the guide.
-        sessions: opens, shoots in and closes sessions.
-        setups: tells whether the station has moved.
+        course: course of the guide.
+        sessions: opens and closes sessions, and shoots control points in them.
+        setups: shows whether the station has moved.
         clock: time.
-        has_aim: something turns the station without an operator.
-        drive: where something drives the boom without an operator; None where nothing does.
+        has_aim: True if the station is turned without an operator.
+        drive: sends the boom to poses without an operator; None if nothing can.
 
     Attributes:
-        wanted: step whose button was pressed, to be carried out; "" for none.
-        busy: step that is carried out; "" for none.
+        wanted: step whose button was pressed and that is pending; "" for none.
+        busy: step that is being carried out; "" for none.
     """
 
     def __init__(
@@ -72,18 +72,18 @@ class GuideWorker:
         self._thread = threading.Thread(target=self._run, name="guide", daemon=True)
 
     def start(self) -> None:
-        """Begin to look."""
+        """Start the thread."""
         self._thread.start()
 
     def stop(self) -> None:
-        """Look no more."""
+        """Stop the thread."""
         self._stopping.set()
         self._cancelled.set()
         if self._thread.is_alive():
             self._thread.join(timeout=_CANCEL_S)
 
     def give_up(self) -> None:
-        """End a shot that is being measured."""
+        """Cancel a shot that is in progress."""
         if not self.busy:
             return
         self._cancelled.set()
@@ -102,7 +102,7 @@ class GuideWorker:
             except Exception as error:
                 self._course.wait()
                 if str(error) != told:
-                    log.exception("the guide has failed; it goes on")
+                    log.exception("error in the guide; it continues")
                 told = str(error)
 
     def _look(self) -> None:
@@ -138,7 +138,7 @@ class GuideWorker:
                 self._look_at_pose(job)
 
     def _send_boom(self, job: Job) -> None:
-        """Have the boom go to the next pose where no operator is at its levers, and again if it was not measured."""
+        """Send a boom without an operator to the next pose; send it again if the pose was not measured."""
         run, number, now_ns = job.run, job.run.next_pose, self._clock.now().monotonic_ns
         step_id, sent_ns = self._driven
         if self._drive is None or number is None or run.poses is None:
@@ -150,7 +150,7 @@ class GuideWorker:
         self._drive([{"dwell_s": _STANDS_S} | {joint.column: joints[joint.name] for joint in self._rig.joints}])
 
     def _look_at_pose(self, job: Job) -> None:
-        """See whether the pose is reached and measured."""
+        """Check whether the pose is reached and measured."""
         run, number = job.run, job.run.next_pose
         found = self._course.record.table.standstill(run.session, run.last)
         self._course.standstill = found = None if found is None or found.pose == run.label else found
@@ -160,14 +160,14 @@ class GuideWorker:
             self._course.happen("measured", {"pose": found.pose, "last": found.last}, only_at=job.step_id)
 
     def _try(self, work: Callable[[], None], step_id: str = "") -> None:
-        """Do something that an operator may have to put right; it is tried again after a while, a shot when asked."""
+        """Do work that may fail until an operator helps; retry it after a pause, or a manual shot on request."""
         self.busy = step_id or "session"
         try:
             work()
         except CommandError as error:
             if not self._cancelled.is_set():
                 job = self._course.record.job
-                if job is not None and job.trouble != str(error):  # it is tried again and again
+                if job is not None and job.trouble != str(error):  # each retry may fail with the same message
                     self._course.happen("failed", {"text": str(error)})
                 self._course.wait()
         finally:
@@ -179,19 +179,19 @@ class GuideWorker:
         job, row = self._course.record.job, self._course.record.row
         if job is None or row is None:
             return
-        if self._setups.has_moved(row.setup_id):  # no session can be held there any more
+        if self._setups.has_moved(row.setup_id):  # no session is possible at this set-up any more
             self._course.abandon(_MOVED)
             return
         last, opened = self._course.record.table.newest_observation(), self._sessions.open_session()
         wanted = {"prism": job.run.prism, "kind": job.run.kind, "setup": row.setup_id, "note": f"guide {row.id}"}
         if opened is None or any(opened[key] != value for key, value in wanted.items()):
             opened = self._sessions.start_command(wanted | {"operator": row.operator}, is_aimed=False)
-        # Else it was opened just before the daemon ended.
+        # Otherwise the session was opened just before the daemon ended.
         with self._course.at_once():
             guide, now = self._course.record.opened(), self._sessions.open_session()
             if guide is not None and guide[0].id == row.id:
                 self._course.happen("opened", {"session": opened["id"], "last": last})
-            elif now is not None and now["id"] == opened["id"]:  # the guide was abandoned while it was being opened
+            elif now is not None and now["id"] == opened["id"]:  # the guide was abandoned in the meantime
                 self._sessions.abort_command({})
 
     def _close_session(self) -> None:
@@ -206,5 +206,5 @@ class GuideWorker:
     def _shoot(self, point: str, step_id: str) -> None:
         shot = self._sessions.shoot_command({"point": point}, most_off_mm=CONTROL_POINT_RADIUS_MM)
         self._course.happen("shot", {"point": point, "misclosure_mm": shot["misclosure_mm"]}, only_at=step_id)
-        if shot["moved"] and shot["phase"] == "start":  # nothing that is measured from here on could be used
+        if shot["moved"] and shot["phase"] == "start":  # no measurement from here on would be usable
             self._course.abandon(_MOVED)

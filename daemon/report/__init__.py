@@ -1,1 +1,1 @@
-"""Pages for people: calibration, gap, comparison of methods, and the experiments of Zhou et al. 2022."""
+"""HTML reports: calibration, gap, comparison of methods, and the experiments of Zhou et al. 2022."""

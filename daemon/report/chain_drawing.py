@@ -20,9 +20,9 @@ def chain_svg(poses: Mapping[str, Bodies], at: Site, title: str) -> bytes:
     """Draw a rig in one or two poses.
 
     Args:
-        poses: what each is called, e.g. `zero pose` -> the machine in one pose.
-        at: gives radii and floor.
-        title: above the drawing.
+        poses: name of a pose, e.g. `zero pose` -> the machine in that pose.
+        at: site with the radii of the links and the floor.
+        title: text above the drawing.
 
     Returns:
         SVG.
@@ -66,7 +66,7 @@ def _draw(axes: Axes, bodies: Bodies, across: Sequence[int], colour: str, *, nam
 
 
 def _name(axes: Axes, places: Mapping[str, Sequence[float]], u: int, v: int, colour: str) -> None:
-    """Write names beside places, those of the same place together."""
+    """Write names next to places; places with several names get one label."""
     at: dict[tuple[float, float], list[str]] = {}
     for name, place in places.items():
         at.setdefault((round(float(place[u]), 2), round(float(place[v]), 2)), []).append(name)
@@ -79,7 +79,7 @@ def _name(axes: Axes, places: Mapping[str, Sequence[float]], u: int, v: int, col
 
 
 def _thicken(axes: Axes, at: Site) -> None:
-    """Give the links their radii, now that the scale of the axes is settled."""
+    """Set line widths to the radii of the links, once the scale of the axes is final."""
     (left, _), (right, _) = (axes.transData.transform((x, 0.0)) for x in axes.get_xlim())
     low, high = axes.get_xlim()
     points_per_m = (right - left) / (high - low) * _POINTS_PER_IN / axes.figure.dpi

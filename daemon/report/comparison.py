@@ -1,4 +1,4 @@
-"""Methods side by side: the second paper's Table 4 as a page, for any rig and data."""
+"""The comparison of methods as a page: Table 4 of the second paper, for any rig and data."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from daemon.report.words import listed, number
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_COLOURS: Mapping[str, str] = {  # methods and residuals are drawn in two panels, where colours return
+_COLOURS: Mapping[str, str] = {  # methods and residuals are drawn in two panels, which reuse colours
     NOMINAL: drawing.BEFORE,
     "km": "#e69f00",
     "skcm": "#009e73",
@@ -35,7 +35,7 @@ _COLOURS: Mapping[str, str] = {  # methods and residuals are drawn in two panels
 HEADER = ("method", "mean", "max", "std", "rms", "mean, training", "seconds", "on top of the kinematics")
 LOWEST = "*"
 TEXT_COLUMNS = (0, len(HEADER) - 1)
-_TRAINING = "training_mean_mm"  # the lowest of these is no merit
+_TRAINING = "training_mean_mm"  # not marked: the lowest training error is no merit
 _FIGURES = (("mean_mm", "mean"), ("max_mm", "worst fix"), ("std_mm", "standard deviation"))
 _PAGE_HEADER = ("method", "mean", "worst", "standard deviation", "root mean square", "mean where fitted", "seconds")
 
@@ -44,9 +44,9 @@ def comparison_page(comparison: Comparison, sources: Mapping[str, str], facts: F
     """Return one self-contained HTML document.
 
     Args:
-        comparison: of the methods.
+        comparison: results of the methods.
         sources: label -> origin of the data.
-        facts: the first lines of the page; the rig alone where nothing more is known.
+        facts: the first lines of the page; by default the rig's name alone.
     """
     with drawing.styled():
         content = [
@@ -59,22 +59,22 @@ def comparison_page(comparison: Comparison, sources: Mapping[str, str], facts: F
                         _in_words(row, result)
                         for row, result in zip(table_rows(comparison), comparison.results, strict=True)
                     ],
-                    caption=f"Position error in mm on {comparison.held_out} held-out fixes; {LOWEST} the lowest",
+                    caption=f"Position error in mm on {comparison.held_out} held-out fixes; {LOWEST} marks the lowest",
                     text_columns=TEXT_COLUMNS,
                     classes=["best" if r.method == "default" else "" for r in comparison.results],
                 ),
                 markup.items(in_words(text) for text in refused) if (refused := _refusals(comparison)) else "",
                 drawing.picture(
                     dots(comparison),
-                    "Mean, greatest and standard deviation of the error per method, and the noise floor",
+                    "Mean, maximum and standard deviation of the error per method, and the noise floor",
                     "On the held-out fixes; the axes are logarithmic. The dashed line is the instruments' noise, "
                     "root mean square.",
                 ),
                 drawing.picture(
                     curves(comparison),
                     "Held-out errors of every method, sorted by size",
-                    "Every method's held-out errors, sorted: at 50 % is the median, at 100 % the worst fix. The dashed "
-                    "line is the instruments' noise.",
+                    "Every method's held-out errors, sorted: 50 % is the median, 100 % the worst fix. The dashed line "
+                    "is the instruments' noise.",
                 ),
             ),
             markup.sources_section(sources),
@@ -84,12 +84,12 @@ def comparison_page(comparison: Comparison, sources: Mapping[str, str], facts: F
 
 
 def label(method: str) -> str:
-    """Return a row's name: a method by the name that `calibrate --method` takes, a residual by that of `--residual`."""
+    """Return a row's name, as `calibrate --method` or `--residual` takes it."""
     return f"residual {'none' if method == EFFECTS else method}" if method in RESIDUALS else method
 
 
 def table_rows(comparison: Comparison) -> list[list[str]]:
-    """Return cells as in `HEADER`, the lowest of each column of held-out errors marked."""
+    """Return cells in the order of `HEADER`, with the lowest of each column of held-out errors marked."""
     lowest = {figure: comparison.lowest(figure) for figure in FIGURES if figure != _TRAINING}
     rows = []
     for result in comparison.results:
@@ -115,7 +115,7 @@ def refusals(comparison: Comparison) -> list[str]:
 
 
 def dots(comparison: Comparison) -> Figure:
-    """Draw mean, greatest and standard deviation of the held-out error, a dot for every method, and the noise floor."""
+    """Draw mean, maximum and standard deviation of the held-out error, a dot per method, and the noise floor."""
     results = _applicable(comparison)
     figure = drawing.new_figure(1.2 + 0.34 * len(results))
     for axes, (key, title) in zip(figure.subplots(1, len(_FIGURES), sharey=True), _FIGURES, strict=True):
@@ -142,7 +142,7 @@ def dots(comparison: Comparison) -> Figure:
 
 
 def curves(comparison: Comparison) -> Figure:
-    """Draw held-out errors in rising order: of the methods, and of the residuals on the default's kinematics."""
+    """Draw sorted held-out errors of the methods, and of the residuals on the kinematics of the default method."""
     results = _applicable(comparison)
     panels = {
         "methods": [r for r in results if r.method not in RESIDUALS],
@@ -174,9 +174,9 @@ def _applicable(comparison: Comparison) -> list[MethodResult]:
 
 
 def headline(comparison: Comparison) -> str:
-    """Say the result in one sentence."""
+    """Return the result in one sentence."""
     lowest = comparison.lowest("mean_mm")
-    # Residuals that are left out tie with none.
+    # A residual that was not adopted ties with the row without a residual.
     best = max((r for r in comparison.results if r.method in lowest), key=lambda r: r.method == "default")
     nominal = comparison.results[0]
     assert best.error_mm is not None
@@ -184,16 +184,16 @@ def headline(comparison: Comparison) -> str:
     name = _sentence_start(method_words(best.method))
     return (
         f"{name} has the lowest mean error on {comparison.held_out} held-out fixes: "
-        f"{number(float(best.error_mm.mean()))} mm, where the nominal model has "
-        f"{number(float(nominal.error_mm.mean()))} mm."
+        f"{number(float(best.error_mm.mean()))} mm, compared with "
+        f"{number(float(nominal.error_mm.mean()))} mm of the nominal model."
     )
 
 
 def _head(comparison: Comparison, facts: Facts) -> str:
     lead = (
-        f"Every method was calibrated on the same {comparison.training} training fixes and judged on the held-out "
-        "ones, by its last stage. Learned residuals share rigcal's own identification, and differ in what is learned "
-        "on top of it. Seconds are of the whole calibration."
+        f"Every method was calibrated on the same {comparison.training} training fixes. The result of its last stage "
+        "was judged on the held-out fixes. Learned residuals share rigcal's own identification and differ only in the "
+        "learner on top of it. Seconds are the time of the whole calibration."
     )
     own = next((r for r in comparison.results if r.method == "default"), comparison.results[-1])
     rows = f"on {comparison.held_out} held-out fixes"
@@ -209,7 +209,7 @@ def _head(comparison: Comparison, facts: Facts) -> str:
 
 
 def notices(comparison: Comparison) -> list[str]:
-    """Return what there is to note, each sentence once, with the methods that it is about."""
+    """Return all warnings and notes, each sentence once, with the methods that it concerns."""
     about: dict[str, list[str]] = {}
     for result in comparison.results:
         for note in result.notes:
@@ -219,7 +219,7 @@ def notices(comparison: Comparison) -> list[str]:
 
 
 def _refusals(comparison: Comparison) -> list[str]:
-    """Return a sentence for every reason that methods do not apply."""
+    """Return a sentence for every reason why methods do not apply, with these methods."""
     about: dict[str, list[str]] = {}
     for result in comparison.results:
         if result.reason is not None:

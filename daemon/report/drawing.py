@@ -1,4 +1,4 @@
-"""The look of all plots, the parts that several of them have, and figures as SVG; drawn with no display."""
+"""Style and shared parts of all plots, and figures as SVG, drawn without a display."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
 
-# Okabe and Ito's palette: told apart by readers with any colour vision, and apart in grey as well.
+# Okabe and Ito's palette: distinguishable with any colour vision, and in grey as well.
 BEFORE = "#8c8c8c"
 MIDDLE = "#d55e00"
 AFTER = "#0072b2"
@@ -46,7 +46,7 @@ _STYLE: Any = {
     "grid.color": GRID,
     "grid.linewidth": 0.8,
     "text.color": INK,
-    "text.parse_math": False,  # a dollar sign in a name is a dollar sign
+    "text.parse_math": False,  # a dollar sign in a name is plain text
     "xtick.color": SOFT,
     "ytick.color": SOFT,
     "xtick.major.size": 3,
@@ -57,7 +57,7 @@ _STYLE: Any = {
     "svg.hashsalt": "rigcal",  # the same report gives the same bytes
     "image.cmap": "viridis",
 }
-# On a dark screen a drawing turns its own neutral colours round: paper, ink, lines. A printed page stays light.
+# On a dark screen a drawing inverts its neutral colours: paper, ink, lines. A printed page stays light.
 _TURNED = {
     "#ffffff": "#14191f",
     "white": "#14191f",
@@ -81,30 +81,33 @@ _TURNED_RULES = "".join(
 _DARK = f"@media screen and (prefers-color-scheme: dark) {{{_TURNED_RULES}}}"
 RASTER_DPI = 150
 WIDTH_IN = 9.6
-LABEL_CHARACTERS = 60  # of a name beside an axis
+LABEL_CHARACTERS = 60  # maximum length of a name next to an axis
 _DOTS_MAX = 4000  # in a map
-_ABOVE_IN, _BELOW_IN, _BESIDE_IN = 0.6, 0.5, 0.6  # legend and title; ticks and label of an x axis; those of a y axis
-FLOOR_MM = 1e-3  # below this an error has no place on a logarithmic axis
+_ABOVE_IN, _BELOW_IN, _BESIDE_IN = 0.6, 0.5, 0.6  # legend and title; ticks and label of an x axis; of a y axis
+FLOOR_MM = 1e-3  # smaller errors are drawn at this value on a logarithmic axis
 
 
 def styled() -> AbstractContextManager[None]:
-    """Return a context in which figures have the report's look; settings are the process's, so one thread draws."""
+    """Return a context in which figures have the report's style.
+
+    The settings are global to the process: only one thread may draw.
+    """
     import matplotlib
 
     return matplotlib.rc_context(_STYLE)
 
 
 def new_figure(height_in: float) -> Figure:
-    """Return an empty figure that belongs to no window."""
+    """Return an empty figure without a window."""
     from matplotlib.figure import Figure
 
     return Figure(figsize=(WIDTH_IN, height_in), layout="constrained")
 
 
 def even_grid(lines: int, columns: int, *, line_in: float) -> tuple[Figure, NDArray[np.object_]]:
-    """Return a figure with a legend's room above (lines, columns) axes that share y, and these.
+    """Return a figure with room for a legend at the top, and its (lines, columns) axes, which share y.
 
-    The margins are given: to find out those of many axes, matplotlib draws them all once more.
+    The margins are fixed: to compute them for many axes, matplotlib would draw everything a second time.
     """
     from matplotlib.figure import Figure
 
@@ -123,12 +126,12 @@ def even_grid(lines: int, columns: int, *, line_in: float) -> tuple[Figure, NDAr
 
 
 def picture(figure: Figure, description: str, caption: str) -> str:
-    """Return the HTML of a figure, which holds the drawing itself, with its caption.
+    """Return the HTML of a figure with the drawing embedded, and its caption.
 
     Args:
         figure: the drawing.
-        description: its content in words, which screen readers read out.
-        caption: the sentences below.
+        description: its content in words, for screen readers.
+        caption: the text below the drawing.
     """
     out = io.BytesIO()
     figure.savefig(out, format="svg", dpi=RASTER_DPI, metadata={"Date": None, "Creator": None})
@@ -159,12 +162,12 @@ def sizes_mm(errors_mm: Floats) -> Floats:
 
 def scatter(axes: Axes, x: Floats, y: Floats, colour: str, *, size: float = 7.0, alpha: float = 0.55) -> None:
     """Draw dots without edges."""
-    # Many dots are drawn as a picture inside the SVG, a few as shapes.
+    # Many dots are rasterised inside the SVG; a few are drawn as shapes.
     axes.scatter(x, y, s=size, c=colour, alpha=alpha, linewidths=0, rasterized=len(x) > 200)
 
 
 def key(colour: str, label: str) -> Line2D:
-    """Return a dot for a legend."""
+    """Return a legend entry with a dot."""
     from matplotlib.lines import Line2D
 
     return Line2D([], [], marker="o", linestyle="", color=colour, markersize=5, label=label)
@@ -178,8 +181,8 @@ def robust_reach(errors_mm: Floats) -> float:
 
 
 def running_median(x: Floats, y: Floats) -> tuple[Floats, Floats]:
-    """Return rising places along x and the median of y about each."""
-    # Medians of groups with equally many fixes; a joint that did not move has one.
+    """Return increasing positions along (n,) x and the median of (n,) y around each."""
+    # Medians of groups with equally many fixes; a joint that did not move has one group.
     order = np.argsort(x, kind="stable")
     groups = np.array_split(order, max(1, min(40, len(x) // 12)))
     middles = np.array([np.median(x[group]) for group in groups])
@@ -189,16 +192,19 @@ def running_median(x: Floats, y: Floats) -> tuple[Floats, Floats]:
 
 
 def forward_axis(position_mm: Floats) -> int:
-    """Return the axis, x (0) or y (1), along which a machine with its prisms at (n, 3), base frame, reaches forward.
+    """Return the axis, x (0) or y (1), along which the machine reaches forward.
 
-    In the side view that direction runs across the page.
+    The side view shows this axis horizontally.
+
+    Args:
+        position_mm: (n, 3) prism positions in the base frame.
     """
     x, y, _ = np.abs(np.median(position_mm, axis=0))
     return int(y > x)
 
 
 def views(plan: Axes, side: Axes, forward: int) -> None:
-    """Label a plan and a side view, m, and mark the base's origin."""
+    """Label a plan and a side view in metres, and mark the base's origin."""
     for axes, title, horizontal, vertical in ((plan, "Plan view", "x", "y"), (side, "Side view", "xy"[forward], "z")):
         axes.set_title(title)
         axes.set_xlabel(f"{horizontal}, m")
@@ -208,13 +214,13 @@ def views(plan: Axes, side: Axes, forward: int) -> None:
 
 
 def name_rows(axes: Axes, names: Sequence[str], ends: tuple[float, float], *, size: float | None = None) -> None:
-    """Give horizontal bars their names.
+    """Label horizontal bars with names.
 
     Args:
-        axes: with a bar at each of 0, 1, 2, ... from the top.
-        names: of the bars; long ones are cut.
+        axes: axes with bars at 0, 1, 2, ... from the top.
+        names: names of the bars; long ones are shortened.
         ends: lower and upper end of the axis.
-        size: of the names, points; the usual one by default.
+        size: font size of the names in points; the style's size by default.
     """
     axes.set_yticks(range(len(names)), [shown(name, LABEL_CHARACTERS) for name in names])
     axes.tick_params(axis="y", length=0, labelcolor=INK, labelsize=size)
@@ -225,7 +231,16 @@ def name_rows(axes: Axes, names: Sequence[str], ends: tuple[float, float], *, si
 def dots_and_medians(
     axes: Axes, x: Floats, layers: Sequence[tuple[Floats, str]], limit: float, *, size: float, alpha: float
 ) -> None:
-    """Draw layers of values, each with its colour, against x with running medians; outliers are put at the edge."""
+    """Draw layers of values against x with running medians; outliers appear at the edge.
+
+    Args:
+        axes: axes to draw on.
+        x: (n,) positions.
+        layers: (n,) values and colour of each layer.
+        limit: end of the axis of values.
+        size: size of a dot.
+        alpha: opacity of a dot.
+    """
     for values, colour in layers:
         scatter(axes, x, np.clip(values, -limit, limit), colour, size=size, alpha=alpha)
     for values, colour in layers:
@@ -246,16 +261,16 @@ def map_errors(
     shrink: float,
     label: str,
 ) -> None:
-    """Draw errors over the work volume from above and from the side, on one scale of colours.
+    """Draw errors over the work volume from above and from the side, with one colour scale.
 
     Args:
-        figure: an empty one.
-        layers: for each row of views a word for their titles and the (n,) sizes of the errors, mm.
+        figure: an empty figure.
+        layers: for each row of views, a word for its titles and the (n,) sizes of the errors in mm.
         place_mm: (n, 3) positions in the base frame.
-        forward: as `forward_axis`.
-        size: of a dot.
-        shrink: length of the scale, as a share of the figure.
-        label: of the scale.
+        forward: horizontal axis of the side view, as `forward_axis` returns it.
+        size: size of a dot.
+        shrink: length of the colour scale as a share of the figure.
+        label: label of the colour scale.
     """
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize

@@ -1,4 +1,4 @@
-"""The front of every report: what it is of, whether it passed, how accurate, and who signs for it."""
+"""The front of every report: its subject, the verdict, the accuracy, and the signatures."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ Outcome = Literal["passed", "failed", "not judged"]
 
 @dataclass(frozen=True)
 class Facts:
-    """The subject of a report; what nobody has said is `not given`.
+    """The subject of a report; missing items are shown as `not given`.
 
     Attributes:
-        rig: its name.
+        rig: name of the rig.
         model: number, directory or hash of the model.
-        sessions: measured in.
-        operators: who were responsible.
+        sessions: sessions of the measurement.
+        operators: people who were responsible.
         instruments: total stations.
         setups: station set-ups.
         measured_utc_ns: first and last instant of the measurement.
-        made_utc_ns: when the report was made; without it the same input gives the same bytes.
-        tolerance_mm: root mean square error that the machine may have; None where none is stated.
+        made_utc_ns: time of the report; without it the same input gives the same bytes.
+        tolerance_mm: permitted root mean square error; None if none is stated.
     """
 
     rig: str
@@ -47,7 +47,7 @@ class Facts:
     tolerance_mm: float | None = None
 
     def lines(self) -> dict[str, str]:
-        """Return label -> text, in the order in which they are read."""
+        """Return label -> text, in reading order."""
         return {
             "Rig": self.rig,
             "Model": self.model or NOT_GIVEN,
@@ -71,13 +71,13 @@ class Facts:
 
 @dataclass(frozen=True)
 class Verdict:
-    """Judgement of an error against the tolerance.
+    """Verdict on an error compared with the tolerance.
 
     Attributes:
-        tolerance_mm: that was stated.
-        rms_mm: the error that is held against it.
-        outcome: passed, failed, or not judged: on fixes that the model was fitted to nothing can pass.
-        rows: which fixes.
+        tolerance_mm: stated tolerance.
+        rms_mm: root mean square error that is compared with the tolerance.
+        outcome: passed, failed, or not judged; fixes that the model was fitted to cannot pass.
+        rows: words for the fixes, e.g. `on 94 held-out fixes`.
     """
 
     tolerance_mm: float
@@ -100,13 +100,13 @@ class Verdict:
 
 
 def judge(tolerance_mm: float | None, rms_mm: float, *, is_held_out: bool, rows: str) -> Verdict | None:
-    """Hold an error against a tolerance; None where none is stated.
+    """Compare an error with a tolerance; return None if no tolerance is stated.
 
     Args:
-        tolerance_mm: root mean square error that the machine may have.
+        tolerance_mm: permitted root mean square error.
         rms_mm: the error.
-        is_held_out: the model was not fitted to these fixes.
-        rows: which fixes, as `on 94 held-out fixes`.
+        is_held_out: True if the model was not fitted to these fixes.
+        rows: words for the fixes, e.g. `on 94 held-out fixes`.
     """
     if tolerance_mm is None:
         return None
@@ -117,11 +117,11 @@ def judge(tolerance_mm: float | None, rms_mm: float, *, is_held_out: bool, rows:
 
 @dataclass(frozen=True)
 class Accuracy:
-    """Accuracy in one sentence, with figures side by side where they differ.
+    """Accuracy in one sentence, with a table of figures if there is more than one.
 
     Attributes:
-        sentence: of the result.
-        columns: heading -> figure in mm; none where one figure says it all.
+        sentence: the result.
+        columns: heading -> figure in mm; empty if the sentence contains the only figure.
     """
 
     sentence: str
@@ -129,7 +129,7 @@ class Accuracy:
 
 
 def front(facts: Facts, verdict: Verdict | None, accuracy: Accuracy) -> str:
-    """Return the first lines of a report as HTML: facts, pass or fail, accuracy."""
+    """Return the first lines of a report as HTML: facts, verdict, accuracy."""
     box = markup.paragraph(f"Tolerance: {NO_TOLERANCE}.", "verdict")
     if verdict is not None:
         box = markup.paragraph(verdict.sentence, f"verdict {verdict.outcome.replace(' ', '-')}")
@@ -142,7 +142,7 @@ def front(facts: Facts, verdict: Verdict | None, accuracy: Accuracy) -> str:
 
 
 def signatures() -> str:
-    """Return the block in which those sign by hand who answer for the report."""
+    """Return the block for the handwritten signatures of those responsible for the report."""
     return markup.signature_block(_SIGNATURES)
 
 

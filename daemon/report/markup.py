@@ -1,4 +1,4 @@
-"""HTML of all pages: the style sheet and the pieces. Text that comes from data or files is always escaped."""
+"""HTML of all reports: style sheet and building blocks. Text from data or files is always escaped."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ code { font: .88em/1.4 ui-monospace, "DejaVu Sans Mono", monospace; }
 
 
 def escape(text: object) -> str:
-    """Make text safe to stand in HTML."""
+    """Escape text for use in HTML."""
     return html.escape(shown(text), quote=True)
 
 
@@ -101,9 +101,9 @@ def table(
     Args:
         header: headings of the columns; none if empty.
         rows: the cells.
-        text_columns: columns that are set flush left.
+        text_columns: indices of the left-aligned columns.
         classes: a CSS class for each row.
-        caption: the line above.
+        caption: the line above the table.
     """
     head = "".join(f'<th{_text(i, text_columns)} scope="col">{escape(name)}</th>' for i, name in enumerate(header))
     body = []
@@ -117,13 +117,13 @@ def table(
 
 
 def facts(lines: Mapping[str, str]) -> str:
-    """Return a table of label and text, a line each."""
+    """Return a table with a row for each label and its text."""
     rows = "".join(f'<tr><th scope="row">{escape(k)}</th><td>{escape(text)}</td></tr>' for k, text in lines.items())
     return f'<table class="facts"><tbody>{rows}</tbody></table>'
 
 
 def signature_block(roles: Sequence[str]) -> str:
-    """Return a line to sign on for each role, with place for a name and a date."""
+    """Return a signature line for each role, with space for a name and a date."""
     cells = "".join(f"<td>{escape(role)}<br>name, date, signature</td>" for role in roles)
     return f'<table class="signatures"><tbody><tr>{cells}</tr></tbody></table>'
 
@@ -133,7 +133,7 @@ def _text(column: int, text_columns: Sequence[int]) -> str:
 
 
 def section(title: str, *content: str) -> str:
-    """Return a titled section of ready HTML."""
+    """Return a titled section; the content is HTML."""
     return f"<section><h2>{escape(title)}</h2>{''.join(content)}</section>"
 
 
@@ -143,7 +143,7 @@ def paragraph(text: str, kind: str = "") -> str:
 
 
 def unbroken(paragraphs: str) -> str:
-    """Return ready HTML in which no line ends between a number and its mm."""
+    """Return HTML without line breaks between a number and its mm."""
     return paragraphs.replace(" mm", "&nbsp;mm")
 
 
@@ -153,19 +153,19 @@ def items(sentences: Iterable[str]) -> str:
 
 
 def details(title: str, content: str) -> str:
-    """Return ready HTML that a click unfolds."""
+    """Return a section of HTML that unfolds on a click."""
     return f"<details><summary>{escape(title)}</summary>{content}</details>"
 
 
 def notice(sentences: Sequence[str]) -> str:
-    """Return a box of sentences; nothing where there are none."""
+    """Return a box of sentences; empty if there are none."""
     if not sentences:
         return ""
     return f'<div class="notice" role="note"><strong>Please note</strong>{items(sentences)}</div>'
 
 
 class Tile(NamedTuple):
-    """A figure in large type; `after` marks the result among the others."""
+    """A figure in large type; the kind `after` highlights the result."""
 
     label: str
     value: str
@@ -177,11 +177,11 @@ def header(title: str, front: str, headline: str, lead: str, tiles: Iterable[Til
     """Return the top of a page.
 
     Args:
-        title: of the page.
-        front: ready HTML under the title: what the page is of.
+        title: title of the page.
+        front: HTML below the title: the subject of the page.
         headline: the result in one sentence.
-        lead: its meaning in a few sentences.
-        tiles: the figures of the result.
+        lead: meaning of the result in a few sentences.
+        tiles: figures of the result.
     """
     figures = "".join(
         f'<div class="{tile.kind}"><dt>{escape(tile.label)}</dt>'
@@ -201,7 +201,7 @@ def sources_section(sources: Mapping[str, str], extra: str = "") -> str:
 
 
 def page(title: str, content: str) -> str:
-    """Return the whole document: one file, nothing loaded from elsewhere."""
+    """Return the whole document: one file that loads nothing else."""
     return (
         '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'

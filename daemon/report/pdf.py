@@ -1,4 +1,4 @@
-"""A report's page as PDF, by WeasyPrint, which is optional: it needs Pango from the system (docs/decisions/0031)."""
+"""Reports as PDF by WeasyPrint, which is optional because it needs Pango from the system (docs/decisions/0031)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ class PdfError(Exception):
 
 
 def pdf_of(page: str) -> bytes:
-    """Return a self-contained page as PDF: A4, numbered, with its own figures; nothing is loaded from elsewhere.
+    """Convert a self-contained page to PDF: A4, with page numbers; nothing is loaded from elsewhere.
 
     Args:
         page: the HTML document.
@@ -23,13 +23,13 @@ def pdf_of(page: str) -> bytes:
     try:
         import weasyprint
         from weasyprint.urls import URLFetcher
-    except (ImportError, OSError) as error:  # OSError: the package is there, and Pango is not
+    except (ImportError, OSError) as error:  # OSError: the package is installed, but not Pango
         raise PdfError(
             f"a PDF needs WeasyPrint with Pango: {HOW_TO_INSTALL}; or print the HTML page from any browser"
         ) from error
 
     for name in ("weasyprint", "fontTools"):
-        logging.getLogger(name).setLevel(logging.ERROR)  # it tells of every CSS property that it does not know
+        logging.getLogger(name).setLevel(logging.ERROR)  # they warn of every unknown CSS property
     fetcher = URLFetcher(allowed_protocols=["data"])
     document: bytes = weasyprint.HTML(string=page, url_fetcher=fetcher).write_pdf()
     return document

@@ -1,4 +1,4 @@
-"""Names of the code in the words of a drawing office: constants, effects, coefficients, methods, units."""
+"""Plain words for names of the code: constants, effects, coefficients, methods, units."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ METHODS = {
     "pde-paper": "published differential evolution",
     "km": "published kinematic calibration",
     "skcm": "published calibration of kinematics and stiffness",
-    "rbf-tcm": "published calibration with a network behind",
+    "rbf-tcm": "published calibration followed by a network",
     "effects": "no learned residual",
 }
 _UNITS = {
@@ -56,12 +56,12 @@ _UNIT_OF_A_NAME = re.compile(
 
 
 def unit_words(unit: str) -> str:
-    """Return a unit in words where its symbol is one of programs or of specialists; millimetres stay mm."""
+    """Return a unit in words if only programs or specialists use its symbol; millimetres stay mm."""
     return _UNITS.get(unit, unit)
 
 
 def joint_words(joint: Joint | str) -> str:
-    """Name a joint's reading; an angle or a length, where its kind is known."""
+    """Name a joint's reading: as an angle or a length if its kind is known."""
     if isinstance(joint, str):
         return f"joint {joint}"
     return f"{'angle' if joint.kind == 'revolute' else 'length'} {joint.name}"
@@ -96,7 +96,7 @@ def method_words(method: str) -> str:
 
 
 def in_words(sentence: str) -> str:
-    """Return a sentence of the calibration with its code names in words; names of columns and commands stay."""
+    """Replace code names in a sentence by plain words; names of columns and commands stay."""
     text = constant_words(sentence)
     text = _EFFECT.sub(lambda found: f"{found[1].replace('_', ' ')} at {found[2]}", text)
     return _code_names().sub(lambda found: _spoken(found[0]), text)
@@ -111,6 +111,6 @@ def _code_names() -> re.Pattern[str]:
     from calibration.effects.library import library
 
     families = [family for family in library() if "_" in family]
-    learners = [name for name in RESIDUALS if name not in ("table", "chain")]  # those two are words of any sentence
+    learners = [name for name in RESIDUALS if name not in ("table", "chain")]  # these two are ordinary words
     names = sorted([*families, *learners], key=len, reverse=True)
     return re.compile(rf"(?<![\w`-])(?:{'|'.join(map(re.escape, names))})(?![\w`-])")

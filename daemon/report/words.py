@@ -1,4 +1,4 @@
-"""Numbers, units and names in the words of reports and commands."""
+"""Formatting of numbers, units and names for reports and commands."""
 
 from __future__ import annotations
 
@@ -37,14 +37,14 @@ def signed(value: float, digits: int = 3) -> str:
 
 
 def readable_unit(unit: str, reach: float) -> tuple[float, str]:
-    """Choose a unit in which numbers need no long rows of zeros.
+    """Choose a unit that avoids long rows of zeros.
 
     Args:
-        unit: the present one; `1` for a plain ratio.
-        reach: the largest magnitude of the numbers.
+        unit: current unit; `1` for a plain ratio.
+        reach: largest magnitude of the numbers.
 
     Returns:
-        The factor to multiply the numbers by, and the unit that they then have.
+        The factor by which to multiply the numbers, and their new unit.
     """
     plain = "" if unit == "1" else unit
     if not math.isfinite(reach) or reach == 0.0 or reach >= 0.1:
@@ -67,12 +67,12 @@ def odds(log_bayes_factor: float) -> str:
 
 
 def probability(share: float) -> str:
-    """Format a probability; 0 and 1 never occur."""
+    """Format a probability; values close to 0 or 1 become `under 0.1 %` or `over 99.9 %`."""
     return "over 99.9 %" if share > 1.0 - _UNLIKELY else "under 0.1 %" if share < _UNLIKELY else f"{100 * share:.1f} %"
 
 
 def chance(p: float) -> str:
-    """Format the probability of a pattern by chance."""
+    """Format the probability that a pattern arises by chance."""
     return "under 0.1 %" if p < _UNLIKELY else f"{100 * p:.1f} %"
 
 
@@ -80,12 +80,12 @@ def chance(p: float) -> str:
 
 
 def place_name(family: str, where: str) -> str:
-    """Name an effect for people."""
+    """Return the name of an effect as people read it."""
     return f"{family.replace('_', ' ')} at {where}"
 
 
 def spoken(effects: Sequence[tuple[str, str]]) -> str:
-    """Name effects in one phrase, the locations of one family together."""
+    """Name effects in one phrase, with the places of each family grouped."""
     by_family: dict[str, list[str]] = {}
     for family, where in effects:
         by_family.setdefault(family, []).append(where)
@@ -93,5 +93,5 @@ def spoken(effects: Sequence[tuple[str, str]]) -> str:
 
 
 def listed(words: Sequence[str]) -> str:
-    """Join words as a sentence does: `a, b and c`."""
+    """Join words as in a sentence: `a, b and c`."""
     return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}" if words else ""

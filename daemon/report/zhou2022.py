@@ -1,4 +1,4 @@
-"""The first paper's section 4 as a page: tables with the paper's own figures beside, and its plots."""
+"""Section 4 of the first paper as a page: its tables next to the paper's own figures, and its plots."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ PATH_NAMES: Mapping[str, str] = {
     "hybrid": "hybrid (rigcal's default)",
 }
 _PATH_LINES = (("before", drawing.BEFORE, 1.2), ("geometric", drawing.MIDDLE, 1.2), ("hybrid", drawing.AFTER, 1.8))
-_SMOOTHED = 24  # points, below which every one is drawn as it is
+_SMOOTHED = 24  # points; shorter trajectories are drawn without smoothing
 
 
 def protocol_page(protocol: Protocol, sources: Mapping[str, str], facts: Facts | None = None) -> str:
@@ -41,7 +41,7 @@ def protocol_page(protocol: Protocol, sources: Mapping[str, str], facts: Facts |
     Args:
         protocol: the experiments.
         sources: label -> origin of the data.
-        facts: the first lines of the page; the rig alone where nothing more is known.
+        facts: the first lines of the page; by default the rig's name alone.
     """
     with drawing.styled():
         content = [
@@ -58,7 +58,7 @@ def protocol_page(protocol: Protocol, sources: Mapping[str, str], facts: Facts |
 
 
 def before_table(protocol: Protocol) -> tuple[list[str], list[list[str]]]:
-    """Return header and rows: prism, then fixes, mean and the paper's mean of each kind of motion."""
+    """Return header and rows: prism, then fixes, mean and the paper's mean for each kind of motion."""
     published = any(prism in PAPER_BEFORE["multi-joint"] for prism in prisms_of(protocol))
     columns = ["prism"]
     for before in protocol.before:
@@ -104,12 +104,12 @@ def paper_rows(protocol: Protocol) -> list[list[str]]:
 
 
 def trajectory_table(path: Trajectory) -> tuple[list[str], list[list[str]]]:
-    """Return header and rows: mean and standard deviation along the path, the paper's beside."""
+    """Return header and rows: mean and standard deviation along the path, next to the paper's."""
     rows = []
     for name, label in PATH_NAMES.items():
         error = path.error_mm[name]
         mean, std = PAPER_TRAJECTORY.get(name, (None, None))
-        remark = " (not taken)" if name in path.left_out else ""
+        remark = " (not adopted)" if name in path.left_out else ""
         rows.append([label + remark, number(float(error.mean())), number(float(error.std())), _cell(mean), _cell(std)])
     return ["predicted with", "mean, mm", "std, mm", "paper mean, mm", "paper std, mm"], rows
 
@@ -128,7 +128,7 @@ def learning_table(points: tuple[LearningPoint, ...]) -> tuple[list[str], list[l
 
 
 def prisms_of(protocol: Protocol) -> list[str]:
-    """Return the prisms of the training or held-out rows, the tip's first as in the paper."""
+    """Return the prisms of the training or held-out rows, those at the tip first as in the paper."""
     found = [name for before in protocol.before for name in before.mean_mm] + list(protocol.held_out_before_mm)
     order = {name: place for place, name in enumerate("rsbw")}
     return sorted(dict.fromkeys(found), key=lambda name: order.get(name, len(order)))
@@ -136,15 +136,15 @@ def prisms_of(protocol: Protocol) -> list[str]:
 
 def not_taken(path: Trajectory) -> list[str]:
     """Return a sentence for each learner that was left out."""
-    return [f"{PATH_NAMES[name]}: no learner was taken: {reason}" for name, reason in path.left_out.items()]
+    return [f"{PATH_NAMES[name]}: no learner was adopted: {reason}" for name, reason in path.left_out.items()]
 
 
 def weights_sentence(front: Front) -> str:
-    """Say the chosen weights."""
+    """Return a sentence on the chosen weights."""
     weights = ", ".join(f"{name} {number(mu, 2)}" for name, mu in front.weight.items())
     return (
-        f"Chosen weights: {weights}: of the {sum(not p.dominated for p in front.points)} points of the front among "
-        f"{len(front.points)} sets of weights, the nearest to every prism's own best, in units of that best."
+        f"Chosen weights: {weights}. Of the {sum(not p.dominated for p in front.points)} points of the front among "
+        f"{len(front.points)} sets of weights, this is the nearest to the best of every prism, in units of that best."
     )
 
 
@@ -192,14 +192,13 @@ def _identification(protocol: Protocol) -> str:
     return markup.section(
         "Identification (Table 3)",
         markup.paragraph(
-            "The rows' constants identified from single-joint data, multi-joint data, and from all data with the "
-            "weights chosen below; base and unknown prism offsets are held where the nominal model puts them, as the "
-            "paper takes them for known. Each is solved by "
-            "the paper's differential evolution at its settings (30,000 candidates, 400 generations, data shuffled and "
-            "the search repeated), and as the converged optimum of the same objective (Eq. 19) within the same bounds: "
-            "where their objectives differ, the search had not come to its end. With the base free, base and unknown "
-            "offsets are searched along, which shows what holding them costs. At bounds: how many of the constants "
-            "ended at the edge of where they may go."
+            "The constants of the rows, identified from single-joint data, from multi-joint data, and from all data "
+            "with the weights chosen below. Base and unknown prism offsets stay at their nominal values, because the "
+            "paper treats them as known. Each set of data is solved twice: by the paper's differential evolution at "
+            "its settings (30,000 candidates, 400 generations, data shuffled and the search repeated), and as the "
+            "converged optimum of the same objective (Eq. 19) within the same bounds. Where the two objectives differ, "
+            "the search had not converged. With the base free, base and unknown offsets are fitted too, which shows "
+            "the cost of holding them. At bounds: the number of constants that ended at one of their bounds."
         ),
         markup.table(columns, rows, text_columns=(0, 1), caption="Mean error on the held-out fixes in mm, per prism"),
         published,
@@ -212,7 +211,7 @@ def _identification(protocol: Protocol) -> str:
 
 
 def identification_figure(protocol: Protocol) -> Figure:
-    """Draw a panel for each prism: dots by data set and way of solving."""
+    """Draw a panel for each prism, with dots by data set and way of solving."""
     prisms = [p for p in prisms_of(protocol) if p in protocol.held_out_before_mm]
     sets = list(dict.fromkeys(line.data for line in protocol.identified))
     figure = drawing.new_figure(1.35 + 0.7 * max(len(sets), 1))
@@ -252,7 +251,7 @@ def _front(front: Front | None) -> str:
         "Pareto front of the weights",
         markup.paragraph(
             "The optimum of Eq. 19 was found for every set of weights on two thirds of the training poses; the errors "
-            f"are those of the other third. {weights_sentence(front)} The held-out fixes played no part."
+            f"are those of the other third. {weights_sentence(front)} The held-out fixes were not used."
         ),
         drawing.picture(
             front_figure(front),
@@ -298,8 +297,8 @@ def _learning(protocol: Protocol) -> str:
     return markup.section(
         "How much data is enough",
         markup.paragraph(
-            "Root mean square error on the held-out fixes after training on so many poses, drawn at random with all "
-            "their fixes."
+            "Root mean square error on the held-out fixes after training on the given number of poses, drawn at random "
+            "with all their fixes."
         ),
         drawing.picture(
             learning_figure(protocol.learning),
@@ -344,8 +343,8 @@ def _trajectory(path: Trajectory) -> str:
         ),
         markup.table(columns, rows, caption="The paper's figures are of its own machine"),
         markup.paragraph(
-            "The paper's three learners are put on the same identified kinematics, without effects. rigcal's default "
-            "adds the named effects that the data ask for, and a learner only where it helps.",
+            "The paper's three learners start from the same identified kinematics, without effects. rigcal's default "
+            "adds the named effects that the data support, and a learner only where it helps.",
             "note",
         ),
         *(markup.paragraph(f"{sentence}.", "note") for sentence in not_taken(path)),
@@ -353,7 +352,7 @@ def _trajectory(path: Trajectory) -> str:
 
 
 def trajectory_figure(path: Trajectory) -> Figure:
-    """Draw the error along the path before and after, with means and standard deviations beside."""
+    """Draw the error along the path before and after, and a panel of means and standard deviations."""
     figure = drawing.new_figure(4.2)
     along, beside = figure.subplots(1, 2, width_ratios=[2.6, 1.0])
     points = np.arange(1, len(path.rows) + 1)

@@ -1,8 +1,8 @@
-"""Who may do what on the page: roles, tokens and a limit on wrong ones.
+"""Permissions on the page: roles, tokens and a limit on wrong tokens.
 
 A token is 256 random bits, shown once when it is made; the file keeps its SHA-256, the name of its owner and the role.
-So much randomness needs no slow hash. The browser keeps the token in a cookie that no script can read, so a token that
-is removed from the file ends at once what is done with it.
+So much randomness needs no slow hash. The browser keeps the token in a cookie that no script can read. Removing a token
+from the file revokes it at once.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from daemon.host.safe_output import write_file
 from drivers.clock import NS_PER_S, Clock, SystemClock
 from drivers.files import read_text
 
-PREFIX = "rigcal_"  # so that scanners for secrets, and people, know one when they see it
+PREFIX = "rigcal_"  # by which people and secret scanners recognise a token
 NAME_CHARACTERS = 60
 _FILE_BYTES = 1 << 20
 _WINDOW_S = 60.0
@@ -37,7 +37,7 @@ _ADDRESSES = 1000
 
 
 class Role(IntEnum):
-    """A role; each may do all that the ones before it may."""
+    """A role; each includes the permissions of the roles before it."""
 
     READ = 1
     OPERATE = 2
@@ -45,7 +45,7 @@ class Role(IntEnum):
 
     @classmethod
     def named(cls, name: str) -> Role:
-        """Return the role of a name, as the command line and the file have it."""
+        """Return the role with a name as on the command line and in the file."""
         return cls[name.upper()]
 
     @property
@@ -59,11 +59,11 @@ ROLE_NAMES = tuple(role.word for role in Role)
 
 @dataclass(frozen=True)
 class Person:
-    """Someone at a browser.
+    """A person at a browser.
 
     Attributes:
-        name: of the token's owner; "" for one who reached the page on the loopback interface without a token.
-        role: what this person may do.
+        name: name of the token's owner; "" for a person on the loopback interface without a token.
+        role: role of the person.
     """
 
     name: str
@@ -89,7 +89,7 @@ class TokenFile:
     """The tokens of a page, in a JSON file that is read again whenever it has changed.
 
     Args:
-        path: of the file; it need not exist.
+        path: path of the file, which need not exist.
     """
 
     def __init__(self, path: Path) -> None:
@@ -99,13 +99,18 @@ class TokenFile:
         self._turn = threading.Lock()
 
     def add(self, name: str, role: Role, created_utc_ns: int) -> str:
-        """Make a token and keep its hash.
+        """Make a token and store its hash.
+
+        Args:
+            name: name of the owner.
+            role: role of the owner.
+            created_utc_ns: present time.
 
         Returns:
-            The token, which nobody can tell again.
+            The token, which cannot be recovered later.
 
         Raises:
-            CommandError: the name is taken or none, or the file cannot be read or written.
+            CommandError: the name is taken or invalid, or the file cannot be read or written.
         """
         if not 1 <= len(name) <= NAME_CHARACTERS or not name.isprintable() or not name.strip():
             raise CommandError(f"a token's name is 1 to {NAME_CHARACTERS} printable characters, not {name!r:.80}")
@@ -119,10 +124,10 @@ class TokenFile:
         return token
 
     def remove(self, name: str) -> None:
-        """Remove a token: whoever uses it is refused from now on.
+        """Remove a token, which is refused from then on.
 
         Raises:
-            CommandError: there is none of that name, or the file cannot be read or written.
+            CommandError: there is no token of that name, or the file cannot be read or written.
         """
         with self._alone():
             entries = self.entries()
@@ -152,7 +157,7 @@ class TokenFile:
             return self._entries
 
     def find(self, token: str) -> Person | None:
-        """Return whose token it is; None of one that is unknown."""
+        """Return the owner of a token; None if the token is unknown."""
         digest = _digest(token)
         for entry in self.entries():
             if secrets.compare_digest(entry.sha256, digest):
@@ -161,9 +166,9 @@ class TokenFile:
 
     @contextlib.contextmanager
     def _alone(self) -> Iterator[None]:
-        """Hold the lock of the file's directory: of two processes that change the file, one reads what the other wrote.
+        """Hold a lock on the file's directory, so that processes change the file one after the other.
 
-        The kernel drops the lock when the process ends, however it ends.
+        The kernel releases the lock when the process ends, however it ends.
         """
         try:
             directory = os.open(self.path.parent, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
@@ -182,7 +187,9 @@ class TokenFile:
             raise CommandError(f"{self.path}: cannot be read: {error.strerror}", FAILED) from error
         except (ValidationError, ValueError) as error:
             first = str(error).splitlines()[0]
-            raise CommandError(f"{self.path}: not a file of tokens ({first}); remove it and add them anew") from error
+            raise CommandError(
+                f"{self.path}: not a token file ({first}); remove it and add the tokens again"
+            ) from error
         for entry in entries:
             if entry.role not in ROLE_NAMES:
                 raise CommandError(
@@ -191,7 +198,7 @@ class TokenFile:
         return entries
 
     def _write(self, entries: tuple[_Entry, ...]) -> None:
-        """Write the file for its owner and, to be read, for the group of its directory."""
+        """Write the file, readable and writable by its owner and readable by the group of its directory."""
         text = json.dumps({"tokens": [entry.model_dump() for entry in entries]}, indent=1) + "\n"
         try:
             write_file(self.path, text.encode())
@@ -202,13 +209,13 @@ class TokenFile:
 
 
 class AttemptLimit:
-    """Counts wrong tokens: so many a minute from one address, and so many from all of them.
+    """Limits the number of wrong tokens per minute, from one address and from all addresses.
 
-    A right token is never kept waiting, whoever else tries wrong ones from its address. A wrong one that is tried again
-    is none that is guessed: a browser that keeps a removed token asks with it for days.
+    A correct token is never delayed, even if others try wrong tokens from its address. A wrong token that is tried
+    again is not a guess: a browser that keeps a removed token sends it for days.
 
     Args:
-        clock: of the computer.
+        clock: clock of the computer.
     """
 
     def __init__(self, clock: Clock | None = None) -> None:
@@ -218,7 +225,7 @@ class AttemptLimit:
         self._known: deque[str] = deque(maxlen=_ADDRESSES)
 
     def is_known(self, token: str) -> bool:
-        """Return True of a wrong token that was counted already."""
+        """Return True for a wrong token that was counted already."""
         return _digest(token) in self._known
 
     def note(self, address: str, token: str) -> None:
@@ -231,7 +238,7 @@ class AttemptLimit:
         self._all.append(now_ns)
 
     def wait_s(self, address: str) -> float:
-        """Return how long this address must wait before another wrong token is answered; 0 where it need not."""
+        """Return how many seconds this address must wait before its next wrong token is answered; 0 for no wait."""
         own = self._wrong.get(address)
         return max(self._left_s(own, _WRONG_PER_ADDRESS) if own else 0.0, self._left_s(self._all, _WRONG_IN_ALL))
 
@@ -242,7 +249,7 @@ class AttemptLimit:
 
 
 def role_refusal(person: Person, needed: Role) -> str:
-    """Say that a person may not do what needs a higher role."""
+    """Return a sentence that refuses an action for which a person's role is too low."""
     who = f"the token of {person.name}" if person.name else "this page, opened without a token,"
     return f"this needs the role {needed.word}, and {who} has the role {person.role.word}"
 

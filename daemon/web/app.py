@@ -1,4 +1,4 @@
-"""The addresses of the page: its files, the live state, commands, and what the store holds."""
+"""The routes of the page: its files, the live state, commands, and data from the store."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ Handler = Callable[[Request], Awaitable[Response]]
 
 
 class Refused(Exception):  # noqa: N818 - becomes an answer
-    """A request that is answered with a status and a sentence."""
+    """A refused request; it is answered with a status and a sentence."""
 
     def __init__(self, status: int, sentence: str, **headers: str) -> None:
         super().__init__(sentence)
@@ -54,13 +54,13 @@ def make_app(settings: WebSettings) -> Guard:
 
 
 class Page:
-    """The addresses.
+    """The routes of the page.
 
     Args:
-        settings: where the page is served and whom it asks.
+        settings: settings of the server.
 
     Attributes:
-        app: answers requests that the guard has let through.
+        app: ASGI application for requests that the guard has accepted.
     """
 
     def __init__(self, settings: WebSettings) -> None:
@@ -69,7 +69,7 @@ class Page:
         self._daemon, self._feed = DaemonClient(settings.socket), LiveFeed(settings.socket)
         self._fixes = SessionFixes()
         self._shape: dict[str, Any] | None = None
-        # Its start is "__Host-" with TLS: a browser takes that from this very host over TLS alone.
+        # With TLS the name begins with "__Host-": browsers accept such a cookie only from this host and over TLS.
         self._cookie = "__Host-rigcal" if settings.is_secure else "rigcal"
         routes = [
             *(Route(f"/{name}", self._shell) for name in ("", *SCREENS)),
@@ -93,10 +93,10 @@ class Page:
         }
         self.app = Starlette(routes=routes, exception_handlers=errors)  # type: ignore[arg-type]
 
-    # ---- who asks ----------------------------------------------------------------------------------------------------
+    # ---- people ------------------------------------------------------------------------------------------------------
 
     async def _person(self, request: Request) -> Person | None:
-        """Return who asks: by the token in the cookie, else what anyone may who comes by the loopback interface."""
+        """Return the person of a request: by the token in the cookie, else by the rights on the loopback interface."""
         token = request.cookies.get(self._cookie)
         if token:
             person = await self._of_token(request, token)
@@ -106,7 +106,7 @@ class Page:
         return None if role is None else Person("", role)
 
     async def _of_token(self, request: Request, token: str) -> Person | None:
-        """Return whose token it is; None of a wrong one, until an address has tried too many."""
+        """Return the owner of a token; None for a wrong one, which is refused after too many from one address."""
         person = self._tokens.find(token) if len(token) <= _TOKEN_CHARACTERS else None
         if person is not None or self._wrong.is_known(token):
             return person
@@ -170,13 +170,13 @@ class Page:
         return FileResponse(STATIC / "index.html", media_type="text/html")
 
     async def _live(self, request: Request) -> Response:
-        """Tell the state for as long as the browser listens and may."""
+        """Stream the state while the browser is connected and has access."""
         events = self._feed.events()
         try:
             first = await anext(events)
         except Full:
             raise Refused(
-                503, "so many browsers look already that no more are taken", **{"Retry-After": "10"}
+                503, "too many browsers are connected; close one or try again later", **{"Retry-After": "10"}
             ) from None
 
         async def all_events() -> Any:
@@ -195,7 +195,7 @@ class Page:
         body = await _object(request)
         command, arguments = body.get("command"), body.get("arguments", {})
         if not isinstance(command, str) or command not in COMMANDS or not isinstance(arguments, dict):
-            raise Refused(400, f"{command!r:.80} is no command of the page")
+            raise Refused(400, f"{command!r:.80} is not a command of the page")
         person = await self._needs(request, COMMANDS[command])
         if COMMANDS[command] > Role.READ:
             arguments = arguments | {"operator": self._operator(person, body.get("operator"))}
@@ -203,13 +203,13 @@ class Page:
         return JSONResponse({"result": result})
 
     def _operator(self, person: Person, said: object) -> str:
-        """Return who gives a command, with the role: a token's owner, or the name that was said without a token."""
+        """Return name and role of the person who gives a command; without a token, the name that the person entered."""
         name = person.name or (said if isinstance(said, str) else "") or self._settings.user
         if len(name) > NAME_CHARACTERS or not name.isprintable():
             raise Refused(400, f"a name has at most {NAME_CHARACTERS} printable characters")
         return f"{name} (page, {person.role.word})".strip()
 
-    # ---- what the store and the files hold ---------------------------------------------------------------------------
+    # ---- data from store and files -----------------------------------------------------------------------------------
 
     async def _rig(self, request: Request) -> Response:
         del request
@@ -244,17 +244,17 @@ class Page:
         return JSONResponse(found)
 
     async def _report(self, request: Request) -> Response:
-        """Send the report of a job, in a sandbox: it is a whole page of its own."""
+        """Send the report of a job, which is a separate page and runs in a sandbox."""
         jobs = await self._daemon.ask("jobs.list")
         wanted = request.path_params["job"]
         path = next(((job["result"] or {}).get("report") for job in jobs if str(job["id"]) == wanted), None)
         if path is None or not Path(path).is_file():
-            raise Refused(404, f"job {wanted:.20} has left no report")
+            raise Refused(404, f"job {wanted:.20} has no report")
         return FileResponse(path, media_type="text/html", headers={"Content-Security-Policy": REPORT_POLICY})
 
 
 async def _object(request: Request) -> dict[str, Any]:
-    """Return the JSON object that a request holds."""
+    """Return the JSON object in a request."""
     with contextlib.suppress(ValueError, RecursionError):
         body = await request.json()
         if isinstance(body, dict):

@@ -1,7 +1,7 @@
-"""Commands of the daemon that the page may give, and the role that each needs.
+"""Commands of the daemon that the page may send, and the role that each needs.
 
-What is not named here cannot be done from a browser: setting up devices, deleting from the store, decoding it again,
-driving a simulated boom.
+A browser can send no other command: it cannot set up devices, delete from the store, decode the store again, or drive
+a simulated boom.
 """
 
 from __future__ import annotations

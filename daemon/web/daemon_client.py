@@ -1,4 +1,4 @@
-"""Questions to the daemon, over its control socket, from a process that must never wait for one."""
+"""Requests to the daemon over its control socket, from a process that must never block."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from typing import Any
 from daemon.commands import FAILED, REFUSED, CommandError, reading_socket
 from daemon.control.protocol import how_to_be_let_in, request_line, result_of, unreachable
 
-_ANSWER_BYTES = 64 << 20  # of one line; a store of years has long lists
+_ANSWER_BYTES = 64 << 20  # longest line; a store of years has long lists
 _AT_A_TIME = 8  # the daemon serves 32 clients
 
 Streams = tuple[asyncio.StreamReader, asyncio.StreamWriter]
 
 
 class DaemonClient:
-    """Asks the daemon; every question has a connection of its own.
+    """Sends requests to the daemon, each over a separate connection.
 
     Args:
-        path: the control socket; the one for those who only look is tried where this one is closed to the process.
+        path: the control socket; the read-only socket is tried if this process may not use the control socket.
     """
 
     def __init__(self, path: Path) -> None:
@@ -43,10 +43,10 @@ class DaemonClient:
 
 
 class DaemonConnection:
-    """One connection that is kept from one question to the next, as long as it lasts.
+    """One connection that is kept open between requests as long as possible.
 
     Args:
-        path: as of `DaemonClient`.
+        path: as in `DaemonClient`.
     """
 
     def __init__(self, path: Path) -> None:
@@ -54,10 +54,10 @@ class DaemonConnection:
         self._streams: Streams | None = None
 
     async def ask(self, command: str, arguments: Mapping[str, Any] | None = None, *, timeout_s: float) -> Any:
-        """Send one command and return its result; after an error the next question makes a new connection.
+        """Send one command and return its result; after an error the next request opens a new connection.
 
         Raises:
-            CommandError: as of `DaemonClient.ask`.
+            CommandError: as in `DaemonClient.ask`.
         """
         try:
             async with asyncio.timeout(timeout_s):
@@ -69,7 +69,7 @@ class DaemonConnection:
             self.close()
             raise unreachable(self._path, error if isinstance(error, OSError) else OSError(str(error))) from None
         except BaseException:
-            self.close()  # the answer would be taken for that of the next question
+            self.close()  # else the next request would get this answer
             raise
         if not line:
             self.close()
@@ -93,7 +93,7 @@ class DaemonConnection:
             line = await reader.readline()
         except (BrokenPipeError, ConnectionResetError):
             line = b""
-        if not line and is_used:  # the daemon closes what has been idle for long: once more, on a new one
+        if not line and is_used:  # the daemon closes idle connections: retry once on a new one
             self.close()
             return await self._exchange(message)
         return line

@@ -1,8 +1,8 @@
-"""Requirements of every request, checked before anything looks at it, and headers of every answer.
+"""Checks of every request before anything processes it, and headers of every answer.
 
-A request names this computer by one of its own names (else it comes from a page whose name was pointed at it, DNS
-rebinding); one that may change something comes from the page itself, by its Origin, and holds JSON, which no form of
-another page can send; and its body is small.
+A request must name this computer by one of its own names; otherwise it may come from a page whose name was pointed at
+this computer (DNS rebinding). A request that may change something must come from the page itself, by its Origin, and
+contain JSON, which no form of a foreign page can send. The body must be small.
 """
 
 from __future__ import annotations
@@ -37,11 +37,11 @@ HEADERS: Mapping[str, str] = {
 
 
 class Guard:
-    """Refuses what no page of this computer would send, and adds the headers that keep a browser from worse.
+    """Refuses requests that no page of this computer would send, and adds security headers to answers.
 
     Args:
-        app: what gets the requests that are left.
-        settings: names of this computer.
+        app: application that receives the accepted requests.
+        settings: settings of the server, with the names of this computer.
     """
 
     def __init__(self, app: ASGIApp, settings: WebSettings) -> None:
@@ -69,32 +69,32 @@ class Guard:
         await self._app(scope, _bounded(receive), send_guarded)
 
     def _refusal(self, method: str, path: str, headers: Headers) -> tuple[int, str] | None:
-        """Return status and sentence of a request that is refused; None of one that is not."""
+        """Return status and sentence for a refused request; None for an accepted one."""
         hosts = headers.getlist("host")
         if len(hosts) != 1 or not self._settings.is_own_host(_name(hosts[0])):
-            return 421, "this computer is not called so; add the name to [web] names if it is"
+            return 421, "this is not a name of this computer; if it should be, add it to [web] names"
         if path.startswith("/api/") and headers.get("sec-fetch-site") in ("cross-site", "same-site"):
-            return 403, "another page asks for this; only the page itself may"
+            return 403, "a foreign page sent this request; only the page itself may"
         length = headers.get("content-length", "0")
         if not length.isdecimal() or int(length) > BODY_BYTES:
             return 413, _TOO_LARGE
         return None if method in _SAFE_METHODS else self._foreign(hosts[0], headers)
 
     def _foreign(self, host: str, headers: Headers) -> tuple[int, str] | None:
-        """Return status and sentence of a request that changes something and is not the page's own; else None."""
+        """Return status and sentence for a changing request that the page itself did not send; else None."""
         scheme = "https" if self._settings.is_secure else "http"
         if headers.get("origin") != f"{scheme}://{host}":
-            return 403, "what changes something must come from the page itself; reload it"
+            return 403, "a request that changes something must come from the page itself; reload the page"
         if headers.get("content-type", "").partition(";")[0].strip() != "application/json":
-            return 415, "a command is JSON"
+            return 415, "a command must be JSON"
         return None
 
 
-_TOO_LARGE = f"a request holds at most {BODY_BYTES} bytes"
+_TOO_LARGE = f"a request has at most {BODY_BYTES} bytes"
 
 
 def _bounded(receive: Receive) -> Receive:
-    """Return a source of the same messages that ends a body which did not say how long it is."""
+    """Return a source of the same messages that refuses a too long body, for requests without a stated length."""
     taken = 0
 
     async def bounded() -> Message:
@@ -109,7 +109,7 @@ def _bounded(receive: Receive) -> Receive:
 
 
 def _name(host: str) -> str:
-    """Return the name in a Host header without its port; "" where it is none."""
+    """Return the name in a Host header without its port; "" if the header is invalid."""
     try:
         return urlsplit(f"//{host}").hostname or ""
     except ValueError:

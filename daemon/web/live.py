@@ -1,8 +1,9 @@
-"""The daemon's state, read once for all clients and told to each as fast as it listens.
+"""The daemon's state, read once for all clients and sent to each as fast as it receives.
 
-While anyone listens, the state is asked for several times a second. Each client is told the newest state that it has
-not got: one that is slow misses some, and no other notices. What waits for a client is one message and the buffer of
-its connection; a client that takes nothing for `STALLED_S` is closed by the kernel (TCP_USER_TIMEOUT, see `server`).
+While any client is connected, the state is read several times per second. Each client receives the newest state that it
+does not have yet: a slow client misses some states, without effect on the others. At most one message and the buffer of
+its connection are pending for a client. The kernel closes the connection of a client that receives nothing for
+`STALLED_S` (TCP_USER_TIMEOUT, see `server`).
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ ANSWER_S = 1.5
 CLIENTS = 50
 STALLED_S = 20.0
 
-# Of acquisition's status: what the page shows. The rest is for metrics and `rigcal status`.
+# Parts of the acquisition status that the page shows. The rest is for metrics and `rigcal status`.
 _ACQUISITION = ("links", "channels", "stations", "decoding", "gaps", "writer_lag_p99_s", "error", "is_behind")
 _STATUS = (
     *("rig", "mode", "version", "time", "clock", "alarms", "notices", "session", "control_shots", "jobs", "models"),
@@ -33,12 +34,12 @@ _STATUS = (
 )
 
 
-class Full(Exception):  # noqa: N818 - a state, told to the client with status 503
-    """So many clients listen already that no more are taken."""
+class Full(Exception):  # noqa: N818 - a state, reported to the client with status 503
+    """The maximum number of clients is connected."""
 
 
 class LiveFeed:
-    """Tells clients the daemon's state.
+    """Sends the daemon's state to clients.
 
     Args:
         socket: the daemon's control socket.
@@ -55,16 +56,16 @@ class LiveFeed:
         self._answered_ns: int | None = None
 
     async def events(self) -> AsyncIterator[bytes]:
-        """Yield the newest state, as an event of a text/event-stream, whenever there is one that was not yielded yet.
+        """Yield the newest state, as an event of a text/event-stream, whenever it has changed.
 
         Raises:
-            Full: too many clients listen.
+            Full: too many clients are connected.
         """
         if self._clients >= CLIENTS:
             raise Full
         self._clients += 1
         if self._reader is None or self._reader.done():
-            self._newest = (next(self._number), b"")  # what was read before the last client left is old
+            self._newest = (next(self._number), b"")  # a state from before the last client left is outdated
             self._answered_ns = None
             self._reader = asyncio.create_task(self._read())
         seen = self._newest[0]
@@ -78,13 +79,13 @@ class LiveFeed:
                 self._reader.cancel()
 
     async def _newer(self, seen: int) -> tuple[int, bytes]:
-        """Wait for a state that is newer than the one of number `seen`."""
+        """Wait for a state with a number above `seen`."""
         async with self._told:
             await self._told.wait_for(lambda: self._newest[0] > seen)
             return self._newest
 
     async def _read(self) -> None:
-        """Read the state again and again."""
+        """Read the state periodically."""
         connection = DaemonConnection(self._socket)
         try:
             while True:
@@ -102,7 +103,7 @@ class LiveFeed:
             connection.close()
 
     async def _state(self, connection: DaemonConnection) -> dict[str, Any]:
-        """Return the state for the page; `daemon` says why there is none, None where there is."""
+        """Return the state for the page; its `daemon` is None, or the reason why there is no state."""
         try:
             status = await connection.ask("status", timeout_s=ANSWER_S)
             guide = (await connection.ask("guide.state", timeout_s=ANSWER_S))["guide"]
@@ -116,13 +117,13 @@ class LiveFeed:
 
 
 def shown_state(status: Mapping[str, Any], guide: dict[str, Any] | None) -> dict[str, Any]:
-    """Return what the page shows of the daemon's status and its guide."""
+    """Return the parts of the daemon's status and of its guide that the page shows."""
     acquisition = status["acquisition"]
     return {
         "daemon": None,
         **{key: status[key] for key in _STATUS},
         "acquisition": {key: acquisition[key] for key in _ACQUISITION},
         "guide": guide,
-        # Of the guide as it is shown, which may be a step further than the status.
+        # Uses the guide as shown, which may be a step ahead of the status.
         "next": next_for_page({**status, "guide": guide if guide and guide["state"] == "open" else None}),
     }

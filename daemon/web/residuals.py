@@ -1,4 +1,4 @@
-"""A session's fixes beside what the live model predicts for them."""
+"""A session's fixes with the residuals of the live model."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ _Key = tuple[str, int, str]
 
 
 class SessionFixes:
-    """Reads a session's fixes with their residuals; one reading at a time, each kept until something is new.
+    """Reads a session's fixes with their residuals, one request at a time; the result is cached until data change.
 
-    Nothing heavy is imported before the first residual is asked for.
+    Heavy modules are imported only when residuals are first requested.
     """
 
     def __init__(self) -> None:
@@ -24,17 +24,17 @@ class SessionFixes:
         self._kept: tuple[_Key, dict[str, Any]] | None = None
 
     def read(self, store: Path, session_id: str, model: dict[str, Any] | None) -> dict[str, Any] | None:
-        """Return the fixes of a session, oldest first; None of a session that there is not.
+        """Return the fixes of a session, oldest first; None if there is no such session.
 
         Args:
             store: the database.
-            session_id: which session.
-            model: the live one, as `model.show` tells it; None without one.
+            session_id: ID of the session.
+            model: the live model, as `model.show` returns it; None if no model is live.
 
         Returns:
             `fixes`: id, pose, utc_ns, x_mm, y_mm, z_mm, dwell_s, excluded of each, and residual_mm: [x, y, z] measured
-            less predicted, None where nothing predicts it; `model`: number of the model; `note`: why there are no
-            residuals, or what they rest on, a sentence; "" where there is nothing to say.
+            minus predicted, None without a prediction; `model`: number of the model; `note`: why there are no
+            residuals, or what they are based on, a sentence; "" for no note.
 
         Raises:
             StoreError: the store cannot be read.
@@ -53,7 +53,7 @@ class SessionFixes:
         self, reader: Reader, session_id: str, fixes: list[dict[str, Any]], model: dict[str, Any] | None
     ) -> dict[str, Any]:
         residuals: dict[int, list[float]] = {}
-        note = "No model is live: residuals appear once one is."
+        note = "No model is live: residuals appear once a model is live."
         if model is not None:
             used = [fix["id"] for fix in fixes if fix["excluded"] is None]
             residuals, note = self._residuals(reader, session_id, used, model) if used else ({}, "")
@@ -63,7 +63,7 @@ class SessionFixes:
     def _residuals(
         self, reader: Reader, session_id: str, used: list[int], model: dict[str, Any]
     ) -> tuple[dict[int, list[float]], str]:
-        """Return number of a used fix -> residual, mm, and what to say about them."""
+        """Return number of a used fix -> residual in mm, and a note on the residuals."""
         import numpy as np
 
         from calibration.errors import CalibrationError
@@ -78,7 +78,7 @@ class SessionFixes:
             note = ""
             if not set(rows.setup.tolist()) <= set(live.placements):
                 live = with_refitted_base(live, rows)
-                note = "The live model does not know this set-up: its base is fitted on these very fixes."
+                note = "The live model does not know this set-up: its base is fitted to these same fixes."
             errors_mm = rows.position_mm - Predictor.of(live).predict(rows).position_mm
         except (CalibrationError, OSError) as error:
             return {}, f"No residuals: {error}"

@@ -22,12 +22,12 @@ class WebSettings:
     Attributes:
         socket: the daemon's control socket.
         tokens: file of the tokens.
-        host, port: what it listens on; port 0: any that is free.
-        certificate, key: PEM files for TLS; None for none.
-        names: further names by which browsers may call this computer.
-        loopback_role: what somebody may do who comes by the loopback interface without a token; by the rights of this
-            process when None.
-        user: who runs this process.
+        host, port: address to listen on; port 0 for any free port.
+        certificate, key: PEM files for TLS; None without TLS.
+        names: additional names by which browsers may address this computer.
+        loopback_role: highest role of a person on the loopback interface without a token; by default limited only by
+            the rights of this process.
+        user: user of this process.
     """
 
     socket: Path
@@ -41,7 +41,7 @@ class WebSettings:
     user: str = field(default_factory=getpass.getuser)
 
     def check(self) -> None:
-        """Raise CommandError where the page must not be served so."""
+        """Raise CommandError if the page must not be served with these settings."""
         for path in (self.certificate, self.key):
             if path is not None and not os.access(path, os.R_OK):
                 raise CommandError(f"{path}: cannot be read; TLS needs certificate and key as PEM files")
@@ -51,8 +51,8 @@ class WebSettings:
             return
         if self.certificate is None:
             raise CommandError(
-                f"{self.host} can be reached from other computers: that needs TLS (--certificate and --key), or "
-                "127.0.0.1 in its place"
+                f"{self.host} can be reached from other computers: use TLS (--certificate and --key), or listen on "
+                "127.0.0.1"
             )
 
     @property
@@ -71,9 +71,9 @@ class WebSettings:
         return self.certificate is not None
 
     def is_own_host(self, name: str) -> bool:
-        """Return True if a browser may call this computer so (the Host header, without its port).
+        """Return True if browsers may address this computer by a name (the Host header, without its port).
 
-        A name that an attacker's server resolves to this computer (DNS rebinding) is none of them.
+        This excludes a name that an attacker's server resolves to this computer (DNS rebinding).
         """
         name = name.strip("[]").lower()
         if self.is_loopback:
@@ -86,10 +86,10 @@ class WebSettings:
         return True
 
     def role_without_token(self) -> Role | None:
-        """Return what somebody may do who comes without a token: None for nothing.
+        """Return the role of a person without a token; None for no access.
 
-        On the loopback interface the page lends its own rights: all where this process may use the control socket,
-        looking where it may use the one for those who look.
+        On the loopback interface the page grants its own rights: all if this process may use the control socket, read
+        access if it may use only the read-only socket.
         """
         if not self.is_loopback:
             return None
@@ -98,7 +98,7 @@ class WebSettings:
 
 
 def _may_use(path: Path) -> bool:
-    """Return True unless the socket is there and this process must not connect to it."""
+    """Return True unless the socket exists and this process may not connect to it, or only the read-only one exists."""
     if path.exists():
         return os.access(path, os.W_OK)
     return not reading_socket(path).exists()

@@ -1,4 +1,4 @@
-"""The boom as a drawing needs it: elementary transforms along the way to every prism, from the rig file."""
+"""The boom for drawings: elementary transforms from the base to every prism, from the rig file."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ from calibration.rig.description import parse_rig
 
 
 def shape(text: str) -> dict[str, Any]:
-    """Return what draws a rig at any joint values.
+    """Return the data for drawing a rig at any joint values.
 
     Args:
         text: the rig file.
 
     Returns:
-        `name`; `joints`: name, unit, low and high of each, in the rig's order; `chains`: prism -> its transforms from
-        the base on, each `[rotates, axis, constant, [[joint, coefficient], ...]]`, axis 0 to 2 for x to z. A rotation
-        is about the axis (rad), a translation along it (mm); its size is the constant and the sum of coefficient times
-        the joint's value (deg or mm). `down`: direction of gravity in the base frame.
+        `name`; `joints`: name, unit, low and high of each, in the rig's order; `chains`: prism -> its transforms,
+        starting at the base, each `[rotates, axis, constant, [[joint, coefficient], ...]]`, axis 0 to 2 for x to z. A
+        rotation is about the axis (rad), a translation along it (mm); its size is the constant plus the sum of
+        coefficient times the joint's value (deg or mm). `down`: direction of gravity in the base frame.
     """
     from calibration.kinematics.chain import Chain, Placement
 

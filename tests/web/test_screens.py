@@ -114,7 +114,12 @@ def test_charts_with_nothing_to_show_are_sentences(new_page: NewPage, tmp_path: 
         try:
             page = new_page()
             open_live(page, f"{web.address}/history")
-            for sentence in ("No check session was held", "Nothing adds up", "No known control point", "No model was"):
+            for sentence in (
+                "No check session was compared",
+                "There is no sum",
+                "No known control point",
+                "No model was",
+            ):
                 expect(page.get_by_text(sentence)).to_be_visible()
             expect(page.locator("canvas, summary:visible, .chart:visible")).to_have_count(0)
         finally:
@@ -176,7 +181,7 @@ def test_a_lost_connection_is_said_at_once_and_ends_by_itself(new_page: NewPage,
         )  # as when a tablet leaves the network: nothing comes, and no word of it
         expect(page.locator("#banner")).to_be_visible(timeout=4000)
         expect(page.locator("#connection-text")).to_have_text("Not live")
-        expect(page.locator("#banner")).to_contain_text(re.compile(r"what is shown is \d"), timeout=5000)
+        expect(page.locator("#banner")).to_contain_text(re.compile(r"the data shown are \d"), timeout=5000)
         os.kill(web.process.pid, signal.SIGCONT)
         page.wait_for_selector("body[data-live=yes]", timeout=30_000)
         expect(page.locator("#banner")).to_be_hidden()

@@ -1,4 +1,4 @@
-"""The plots of the calibration report; each takes its input and returns a figure."""
+"""The plots of the calibration report; each takes the report's input and returns a figure."""
 
 from __future__ import annotations
 
@@ -54,15 +54,13 @@ def errors_by_prism(report: ReportInput) -> Figure:
 
 
 def _strip(axes: Axes, norms: Floats, centre: float, colour: str) -> None:
-    # Dots beside each other where the distribution is dense: the width says how many, nothing is smoothed away.
+    # Dots lie side by side where the distribution is dense: the width shows their number, without smoothing.
     order = np.argsort(norms, kind="stable")
     logs = np.log10(norms[order])
     counts, edges = np.histogram(logs, bins=np.linspace(logs[0], logs[-1] + 1e-9, 26))
     widths = 0.16 * np.sqrt(counts / counts.max())
     which = np.clip(np.digitize(logs, edges) - 1, 0, len(counts) - 1)
-    spread = (
-        np.arange(len(logs)) * 0.618034 + 0.5
-    ) % 1.0 * 2.0 - 1.0  # golden-ratio steps: even, and the same on every run
+    spread = (np.arange(len(logs)) * 0.618034 + 0.5) % 1.0 * 2.0 - 1.0  # golden-ratio steps: even and reproducible
     drawing.scatter(axes, centre + spread * widths[which], norms[order], colour, size=6, alpha=0.5)
     rms = float(np.sqrt(np.mean(norms**2)))
     axes.plot([centre - 0.18, centre + 0.18], [rms, rms], color=drawing.INK, linewidth=1.6, solid_capstyle="butt")
@@ -102,7 +100,7 @@ def residual_by_joint(report: ReportInput) -> Figure:
 
 
 def importance(report: ReportInput, most: int = 10) -> Figure:
-    """Draw the features of the learned trees by their share of what the splits gained (Zhou et al. 2022, Fig. 10)."""
+    """Draw the features of the learned trees by their share of the split gain (Zhou et al. 2022, Fig. 10)."""
     lines = report.importance[:most]
     figure = drawing.new_figure(0.7 + 0.27 * len(lines))
     axes = figure.add_subplot()
@@ -112,7 +110,7 @@ def importance(report: ReportInput, most: int = 10) -> Figure:
         axes.annotate(f"{number(share, 2)} %", (share, place), (4, 0), textcoords="offset points", va="center")
     drawing.name_rows(axes, [name for name, _ in lines], (len(lines) - 0.4, -0.6))
     axes.set_xlim(0.0, 1.12 * max(shares))
-    axes.set_xlabel("share of what the splits gained, %")
+    axes.set_xlabel("share of the gain of all splits, %")
     return figure
 
 
@@ -181,7 +179,7 @@ def error_map(report: ReportInput) -> Figure:
     forward = drawing.forward_axis(report.training.position_mm)
     errors_mm = drawing.sizes_mm(table.errors_mm["hybrid"])
     drawing.map_errors(
-        figure, [("", errors_mm)], table.position_mm, forward, size=16, shrink=0.85, label="error left, mm"
+        figure, [("", errors_mm)], table.position_mm, forward, size=16, shrink=0.85, label="remaining error, mm"
     )
     return figure
 
@@ -202,6 +200,6 @@ def corrections(report: ReportInput, most: int = 14) -> Figure:
     drawing.name_rows(axes, [constant_words(p.name) for p in lines], (len(lines) - 0.4, -0.6))
     axes.set_xlim(-reach, reach)
     axes.set_xlabel(
-        f"correction, in build tolerances (the band, {USUAL:g} tolerances, holds 95 % of what building does)"
+        f"correction, in build tolerances (the band of {USUAL:g} tolerances contains 95 % of building errors)"
     )
     return figure

@@ -1,4 +1,4 @@
-"""The calibration report's input from a calibrated model and its evaluations."""
+"""Build the calibration report's input from a calibrated model and its evaluations."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from daemon.report.words import readable_unit
 from drivers.clock import NS_PER_S
 
 _LIBRARIES = ("rigcal", "numpy", "scipy", "numba", "lightgbm")
-# Unit of a coefficient -> how its name ends, what to multiply by, and the unit that people read.
+# Unit of a coefficient -> ending of its name, factor, and unit as people read it.
 _SMALL_UNITS = {"rad": ("_rad", 1e3, "mrad"), "rad/(N m)": ("_rad_per_Nm", 1e6, "mrad/(kN m)")}
 _LABELS = {
     "fixes": "observations fitted",
@@ -57,11 +57,11 @@ def report_input(
     Args:
         training: the model on the rows it was fitted to.
         held_out: the model on rows it never saw, if there are any.
-        made_utc_ns: when the report is made; without it the same model and rows give the same report.
-        sources: label -> text: files or sessions that the data came from, and the model's hash.
+        made_utc_ns: time of the report; without it the same model and rows give the same report.
+        sources: label -> text: files or sessions of the data, and the model's hash.
         setups: station set-ups and control points, where known.
-        latencies: session -> latency of its fixes, or why it is not known, where there are sessions.
-        facts: the first lines of the report; by default what the rows say.
+        latencies: session -> latency of its fixes, or why it is unknown; None for data without sessions.
+        facts: the first lines of the report; derived from rows and model by default.
     """
     model = training.model
     judged = training if held_out is None else held_out
@@ -102,14 +102,14 @@ def facts_of(
     made_utc_ns: int | None = None,
     tolerance_mm: float | None = None,
 ) -> Facts:
-    """Return the first lines of a report from rows and model alone: who measured with what is not in them.
+    """Derive the first lines of a report from rows and model, which do not contain operators and instruments.
 
     Args:
         observations: the rows that the model was fitted to.
         model: the model.
-        name: of the model, as its directory.
-        made_utc_ns: when the report is made.
-        tolerance_mm: root mean square error that the machine may have; None where none is stated.
+        name: name of the model, e.g. its directory.
+        made_utc_ns: time of the report.
+        tolerance_mm: permitted root mean square error; None if none is stated.
     """
     return Facts(
         rig=model.rig.name,
@@ -143,7 +143,7 @@ def measured_in_base_mm(model: CalibratedModel, observations: Observations) -> F
 def _parameters(model: CalibratedModel) -> Iterator[ParameterLine]:
     for p in model.parameters:
         if math.isinf(p.prior_sigma):
-            continue  # nobody knew it before: there is no tolerance to hold it against
+            continue  # no prior, so there is no tolerance to compare with
         scale, unit = (math.degrees(1.0), "deg") if p.unit == "rad" else (1.0, p.unit)
         yield ParameterLine(
             name=p.name,
@@ -175,7 +175,7 @@ def _effects(training: Evaluation) -> Iterator[EffectLine]:
 
 
 def _readable(coefficient: FittedCoefficient) -> tuple[str, float, float, str]:
-    """Return name, value, standard error and unit, without long rows of zeros."""
+    """Return name, value, standard error and unit, scaled to avoid long rows of zeros."""
     suffix, scale, unit = _SMALL_UNITS.get(
         coefficient.unit, ("", *readable_unit(coefficient.unit, abs(coefficient.value)))
     )

@@ -1,4 +1,4 @@
-"""The calibration report's input: plain tables, filled from a calibrated model by `from_model.py`."""
+"""Input of the calibration report: plain tables, which `from_model.py` fills from a calibrated model."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from calibration.rig.description import BEYOND_BUILDING, Joint
 from daemon.report.front import Facts
 
-if TYPE_CHECKING:  # both bring numba, which `status` and `--help` must not wait for
+if TYPE_CHECKING:  # both import numba, which would delay `status` and `--help`
     from calibration.design.accuracy import ExpectedAccuracy
     from calibration.evaluation.latency import Latency
     from calibration.identification.sweeps.cross_check import AxisCheck
@@ -22,12 +22,12 @@ Floats = NDArray[np.float64]
 Strings = NDArray[np.str_]
 Stage = Literal["nominal", "geometric", "effects", "hybrid"]
 STAGES: tuple[Stage, ...] = get_args(Stage)
-USUAL = 2.0  # build tolerances, within which 95 % of the corrections are that building asks for
+USUAL = 2.0  # build tolerances; building causes 95 % of the corrections within them
 
 
 @dataclass(frozen=True)
 class Spread:
-    """Size of a set of position errors, mm: of their norms, over all rows, outliers too."""
+    """Statistics of the norms of position errors in mm, over all rows including outliers."""
 
     n: int
     mean_mm: float
@@ -83,12 +83,12 @@ class ParameterLine:
     """A corrected constant of the kinematic model.
 
     Attributes:
-        name: as the model calls it, e.g. `row4.theta`.
+        name: name in the model, e.g. `row4.theta`.
         unit: `mm` or `deg`.
         correction: what calibration added to the nominal value.
         sigma: its standard deviation after the fit.
-        tolerance: build tolerance, 1 sigma, as the rig file or the estimated prior scale gives it.
-        determined: False where the data cannot see it and it stayed where the drawings put it.
+        tolerance: build tolerance, 1 sigma, from the rig file or the estimated prior scale.
+        determined: False if the data do not determine it and it stayed at the value of the drawings.
     """
 
     name: str
@@ -105,7 +105,7 @@ class ParameterLine:
 
     @property
     def is_unusual(self) -> bool:
-        """True if it is larger than 95 % of the corrections that building asks for."""
+        """True if it is larger than 95 % of the corrections that building causes."""
         return abs(self.in_tolerances) > USUAL
 
     @property
@@ -116,13 +116,13 @@ class ParameterLine:
 
 @dataclass(frozen=True)
 class EffectLine:
-    """A named effect that the model has.
+    """A named effect of the model.
 
     Attributes:
-        family, where: as the library spells them.
-        change, unit: by how much it changes the joint's value, `deg` or `mm`, at most over the rows it was fitted to;
-            by how much it moves the prism, `mm`, where it is at no joint.
-        coefficients: of each its name, value, standard deviation and unit.
+        family, where: family and place, as in the library.
+        change, unit: largest change of the joint's value over the rows it was fitted to, `deg` or `mm`; for an effect
+            that is not at a joint, the largest shift of the prism, `mm`.
+        coefficients: name, value, standard deviation and unit of each coefficient.
     """
 
     family: str
@@ -134,7 +134,7 @@ class EffectLine:
 
 @dataclass(frozen=True)
 class OutlierLine:
-    """A fix that the fit set aside: its row as warnings name it, its prism, how far off it is."""
+    """A fix that the fit set aside: its row as in warnings, its prism, and its error."""
 
     row: str
     prism: str
@@ -144,7 +144,7 @@ class OutlierLine:
 
 @dataclass(frozen=True)
 class ControlPoint:
-    """Misclosure of a control point, mm (x, y, z): shot minus known, at a session's start and at its end."""
+    """Misclosure of a control point, mm (x, y, z): measured minus known, at a session's start and at its end."""
 
     name: str
     start_mm: tuple[float, float, float] | None
@@ -153,7 +153,7 @@ class ControlPoint:
 
 @dataclass(frozen=True)
 class SetupLine:
-    """A station set-up: where the instrument stood and how well it kept its place."""
+    """A station set-up: its instrument, whether it moved, and its control points."""
 
     name: str
     instrument: str
@@ -170,26 +170,26 @@ class ReportInput:
         joints: its joints, for limits and units.
         training: the rows the model was fitted to.
         held_out: rows the fit never saw; None if there were none.
-        noise_mm: scatter of a fix: RMS 3-D, as the fit found it, all that the model does not explain.
-        instrument_mm: instrument noise: RMS 3-D error that station and encoders explain on the judged rows.
+        noise_mm: scatter of a fix about the fitted model, 3-D RMS: all that the model does not explain.
+        instrument_mm: instrument noise: 3-D RMS error that station and encoders explain on the judged rows.
         residual: name of the learned residual, or None.
-        residual_reason: why there is one or none, a sentence.
+        residual_reason: why the model has a learned residual or none, a sentence.
         effects: named effects of the model.
-        effects_reason: why these or why none, a clause.
+        effects_reason: why the model has these effects or none, a clause.
         parameters: kinematic constants with a build tolerance.
-        n_parameters, rank: how many parameters there are and how many the data determine.
-        unidentifiable: names of parameters or combinations that the data cannot see.
+        n_parameters, rank: number of parameters, and how many of them the data determine.
+        unidentifiable: names of parameters or combinations that the data cannot determine.
         outliers: fixes that the fit set aside.
         warnings: sentences for the operator.
         ignored_columns: columns of the data that rigcal does not know (docs/reference/formats.md).
         setups: station set-ups with their control points, where known.
-        latencies: session -> latency of its fixes against the joints, or why it is not known; empty for data of files.
+        latencies: session -> latency of its fixes relative to the joints, or why it is unknown; empty for files.
         provenance: label -> value: data hashes, versions, seed, time.
-        expected: how true the model expects itself to be over the work volume, where that is known.
-        axes: the model held against single-joint sweeps of the judged rows.
-        importance: (feature, its share of what the learned trees' splits gained), the most important first; empty
+        expected: accuracy that the model expects of itself over the work volume, if known.
+        axes: comparison of the model with single-joint sweeps of the judged rows.
+        importance: (feature, its share of the gain of all splits of the learned trees), most important first; empty
             without trees.
-        facts: the first lines of the report; the rig alone where nothing more is known.
+        facts: the first lines of the report; by default the rig's name alone.
     """
 
     rig: str
@@ -219,5 +219,5 @@ class ReportInput:
 
     @property
     def judged(self) -> ErrorTable:
-        """The rows that the report's figures are about: held-out ones, or the training rows where there are none."""
+        """The rows that the report's figures refer to: the held-out rows, or the training rows if there are none."""
         return self.training if self.held_out is None else self.held_out

@@ -1,4 +1,4 @@
-"""The calibration report: one HTML file that a foreman reads from the top and an engineer to the end."""
+"""The calibration report: one HTML file with the result at the top and the details for engineers below."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ _STAGE_WORDS: dict[Stage, str] = {
     "effects": "Effects: named physics added",
     "hybrid": "Hybrid: learned residual added",
 }
-_EXPLAINED = 1.15  # within what a few dozen fixes can tell apart
+_EXPLAINED = 1.15  # ratio to the instrument noise that a few dozen fixes cannot distinguish from 1
 _OUTLIERS_SHOWN = 20
 _PARAMETERS_SHOWN = 14
 _COEFFICIENTS_SHOWN = 2
 _FEATURES_SHOWN = 10
-_MUCH_OPEN = 0.2  # of the expected error: what a direction of approach, a load or a temperature decides
+_MUCH_OPEN = 0.2  # of the expected error: the part that direction of approach, load or temperature determine
 _KNOWN = "direction of approach, load and temperature known"
 _UNKNOWN = "not known"
 
 
 def calibration_report(report: ReportInput) -> str:
-    """Return the report as one self-contained HTML document, the same bytes for the same input."""
+    """Return the report as one self-contained HTML document; the same input gives the same bytes."""
     with drawing.styled():
         parts = [
             _head(report),
@@ -57,7 +57,7 @@ def calibration_report(report: ReportInput) -> str:
 
 
 def headline(report: ReportInput) -> str:
-    """Say the error before and after calibration, and on which poses, in one sentence."""
+    """Return one sentence with the error before and after calibration and the fixes it was judged on."""
     judged = report.judged
     before, after = judged.stage("nominal").rms_mm, judged.stage("hybrid").rms_mm
     verb = "falls" if after < before else "does not fall: it goes"
@@ -70,14 +70,14 @@ def headline(report: ReportInput) -> str:
 def _meaning(report: ReportInput) -> str:
     after = report.judged.stage("hybrid").rms_mm
     if after <= _EXPLAINED * report.instrument_mm:
-        judgement = "What is left is what the instrument noise explains."
+        judgement = "The instrument noise explains the remaining error."
     else:
         judgement = (
-            f"The instrument noise explains {number(report.instrument_mm)} mm of it: the rest is physics that the "
-            "model lacks, or measurements noisier than the rig file says."
+            f"The instrument noise explains {number(report.instrument_mm)} mm of the remaining error. The rest is "
+            "physics that the model lacks, or measurements noisier than the rig file states."
         )
     where = (
-        "No fixes were kept back, so this is how well the model repeats what it was shown, not a promise of accuracy. "
+        "No fixes were held out, so this is how well the model fits its own data, not the accuracy to expect. "
         if report.held_out is None
         else "The model never saw these fixes, so this is the accuracy to expect where the data cover the workspace. "
     )
@@ -115,7 +115,7 @@ def _verdict(report: ReportInput, tolerance_mm: float | None) -> Verdict | None:
 
 
 def _accuracy_sentence(report: ReportInput) -> Accuracy:
-    """Say how accurate the model is where it was judged, and over the work volume."""
+    """Return the accuracy of the model on the judged fixes, and over the work volume."""
     after = report.judged.stage("hybrid")
     sentence = (
         f"Accuracy: {number(after.rms_mm)} mm root mean square {_rows(report)}, {number(after.max_mm)} mm at worst"
@@ -123,7 +123,7 @@ def _accuracy_sentence(report: ReportInput) -> Accuracy:
     expected = report.expected
     if expected is None:
         return Accuracy(f"{sentence}.")
-    sentence += "; over the whole work volume the model itself is expected to be off by"
+    sentence += "; over the whole work volume the expected error of the model itself is"
     if not _depends_on_more(expected):
         return Accuracy(f"{sentence} {number(expected.rms_mm)} mm.")
     known_mm = float(np.hypot(expected.parameters_mm, expected.lacking_mm))
@@ -131,7 +131,7 @@ def _accuracy_sentence(report: ReportInput) -> Accuracy:
 
 
 def _depends_on_more(expected: ExpectedAccuracy) -> bool:
-    """True if poses alone leave so much open that accuracy with and without the rest is told apart."""
+    """True if the error depends so much on more than the pose that accuracy is shown with and without the rest."""
     return expected.open_mm > _MUCH_OPEN * expected.rms_mm
 
 
@@ -158,7 +158,7 @@ def _accuracy(report: ReportInput) -> str:
         drawing.picture(
             figures.errors_by_prism(report),
             "Position error of every fix per prism before and after calibration, on a logarithmic axis",
-            "Every dot is one fix; the axis is logarithmic. The number beside each bar is the root mean square in mm.",
+            "Every dot is one fix; the axis is logarithmic. The number next to each bar is the root mean square in mm.",
         ),
     )
 
@@ -195,16 +195,16 @@ def _expected(report: ReportInput) -> str:
     return markup.section(
         "What to expect elsewhere",
         markup.paragraph(
-            f"How far the model itself is expected to be off, in {len(report.expected.readings)} poses of the whole "
-            f"work volume{place}, measured or not, without the noise of a fix: {number(report.expected.rms_mm)} mm "
-            f"root mean square, {report.expected.where}."
+            f"Expected error of the model itself, without the noise of a fix, in {len(report.expected.readings)} poses "
+            f"of the whole work volume{place}, measured or not: {number(report.expected.rms_mm)} mm root mean square, "
+            f"{report.expected.where}."
         ),
         markup.table(columns, rows, caption="Expected error in mm of each prism"),
     )
 
 
 def _expected_rows(expected: ExpectedAccuracy) -> tuple[list[list[str]], list[str]]:
-    """Return the rows and headings of the expected errors, in two columns where they depend on more than the pose."""
+    """Return rows and headings of the expected errors, with two columns if they depend on more than the pose."""
     columns = ["prism", "root mean square", "median", "95 % within", "99 % within"]
     rows = [
         [prism, *(number(value) for value in (of.rms_mm, of.median_mm, of.p95_mm, of.p99_mm))]
@@ -231,11 +231,11 @@ def _axes(report: ReportInput) -> str:
     return markup.section(
         "Axes measured by single-joint sweeps",
         markup.paragraph(
-            "Where one joint moved alone, its prism's circle or line shows the joint's axis without any model. Here it "
-            "is held against the axis of the calibrated model; intervals are one standard deviation."
+            "Where one joint moved alone, the circle or line of the prism shows the joint's axis without any model. "
+            "This axis is compared with that of the calibrated model; intervals are one standard deviation."
         ),
         markup.table(
-            ["joint", "prism", "angle between, degrees", "distance, mm", "by chance", "remark"],
+            ["joint", "prism", "angle between, degrees", "distance, mm", "probability by chance", "remark"],
             rows,
             text_columns=(0, 1, 5),
             classes=classes,
@@ -245,10 +245,10 @@ def _axes(report: ReportInput) -> str:
 
 def _by_joint(report: ReportInput) -> str:
     return markup.section(
-        "What is left, joint by joint",
+        "Remaining error, joint by joint",
         markup.paragraph(
-            "If the model is complete, the dots scatter evenly about zero whatever the joint reads. A line that "
-            "bends or drifts is physics that the model lacks: play, sag, or an uneven encoder at that joint."
+            "If the model is complete, the dots scatter evenly about zero at every joint reading. A line that bends "
+            "or drifts is physics that the model lacks: play, sag, or an uneven encoder at that joint."
         ),
         drawing.picture(
             figures.residual_by_joint(report),
@@ -262,7 +262,7 @@ def _by_joint(report: ReportInput) -> str:
 def _coverage(report: ReportInput) -> str:
     return markup.section(
         "Where it was measured",
-        markup.paragraph("The model is only as good as the poses it has seen: expect less where there are no dots."),
+        markup.paragraph("The model is only as good as its poses: expect less accuracy where there are no dots."),
         "<h3>Joint ranges</h3>",
         drawing.picture(
             figures.joint_coverage(report),
@@ -275,7 +275,7 @@ def _coverage(report: ReportInput) -> str:
             "Prism positions in plan and side view",
             "Prism positions in the rig's base frame; the cross is its origin.",
         ),
-        "<h3>Error left in the workspace</h3>",
+        "<h3>Remaining error in the workspace</h3>",
         drawing.picture(
             figures.error_map(report),
             "Remaining error over the workspace in plan and side view",
@@ -297,7 +297,7 @@ def _effects(report: ReportInput) -> str:
             head = [""] * 3
         more = len(effect.coefficients) - _COEFFICIENTS_SHOWN
         if more > 0:
-            rows.append([*head, f"and {more} more, which bend its curve", "", ""])
+            rows.append([*head, f"and {more} more, which shape its curve", "", ""])
     columns = [
         "effect",
         "where",
@@ -321,15 +321,15 @@ def _importance(report: ReportInput) -> str:
         return ""
     shown = min(_FEATURES_SHOWN, len(report.importance))
     return markup.section(
-        "What the learned residual looks at",
+        "Features of the learned residual",
         markup.paragraph(
-            f"The {shown} most important of the {len(report.importance)} features of the trees. Features that tell "
-            "the same share what they gain, and importance is no cause."
+            f"The {shown} most important of the {len(report.importance)} features of the trees. Features with the "
+            "same information share their gain, and importance does not prove a cause."
         ),
         drawing.picture(
             figures.importance(report, shown),
-            "Share of each feature in what the splits of the trees gained, the most important first",
-            "By how much splits on each feature lower the squared error of the training rows, of all that splits gain.",
+            "Share of each feature in the gain of all splits of the trees, the most important first",
+            "Share of each feature in the reduction of the squared error of the training rows by all splits.",
         ),
     )
 
@@ -380,10 +380,10 @@ def _identifiability_words(report: ReportInput) -> str:
         return f"The data determine all {report.n_parameters} parameters of the model."
     words = f"The data determine {report.rank} of {report.n_parameters} parameters or combinations of them. "
     if not report.unidentifiable:
-        return words + "The rest stay near the drawings, as the build tolerances say."
+        return words + "The others stay near the drawings, within the build tolerances."
     return (
-        words
-        + "No pose of these data tells the following apart from others; the build tolerances share out what is found:"
+        words + "These data cannot distinguish the following from others; the build tolerances divide the correction "
+        "among them:"
     )
 
 
@@ -393,8 +393,8 @@ def _outliers(report: ReportInput) -> str:
     worst = sorted(report.outliers, key=lambda o: -o.sigmas)[:_OUTLIERS_SHOWN]
     share = 100 * len(report.outliers) / len(report.training)
     words = (
-        f"{len(report.outliers)} of {len(report.training)} fixes ({number(share, 2)} %) did not fit with the others "
-        "and had little or no say in the fit. They still count in every figure of this report."
+        f"{len(report.outliers)} of {len(report.training)} fixes ({number(share, 2)} %) did not agree with the others "
+        "and had little or no weight in the fit. They still count in every figure of this report."
     )
     rows = [[o.row, o.prism, number(o.error_mm), number(o.sigmas, 2)] for o in worst]
     columns = ["row of the data", "prism", "error, mm", "in standard deviations"]
@@ -411,10 +411,10 @@ def _setups(report: ReportInput) -> str:
 
 
 def _setup(setup: SetupLine) -> str:
-    state = "moved during the session" if setup.moved else "kept its place"
+    state = "moved during the session" if setup.moved else "did not move"
     text = f"<h3>{markup.escape(setup.name)}</h3>" + markup.paragraph(f"{setup.instrument}; {state}.")
     if not setup.control_points:
-        return text + markup.paragraph("No control points were shot.", "note")
+        return text + markup.paragraph("No control points were measured.", "note")
     rows = []
     for point in setup.control_points:
         cells = [point.name]
@@ -425,7 +425,7 @@ def _setup(setup: SetupLine) -> str:
             cells += [", ".join(signed(v, 2) for v in misclosure), number(sum(v * v for v in misclosure) ** 0.5, 2)]
         rows.append(cells)
     columns = ["control point", "start x, y, z, mm", "size, mm", "end x, y, z, mm", "size, mm"]
-    return text + markup.table(columns, rows, caption="Misclosure: shot minus known")
+    return text + markup.table(columns, rows, caption="Misclosure: measured minus known")
 
 
 def _ignored(report: ReportInput) -> str:

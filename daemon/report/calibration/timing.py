@@ -1,4 +1,4 @@
-"""Section of the calibration report on how late the station's fixes are against the bus."""
+"""Section of the calibration report on the latency of the station's fixes relative to the bus."""
 
 from __future__ import annotations
 
@@ -8,24 +8,24 @@ from typing import TYPE_CHECKING
 from daemon.report import markup
 from daemon.report.words import PLUS_MINUS
 
-if TYPE_CHECKING:  # brings numba, which `status` and `--help` must not wait for
+if TYPE_CHECKING:  # imports numba, which would delay `status` and `--help`
     from calibration.evaluation.latency import Latency
 
 _CLEAR = 3.0  # standard errors
-_LEAST_MS = 1.0  # by which a latency is uncertain at least: the resolution of stamps
+_LEAST_MS = 1.0  # smallest uncertainty of a latency: the resolution of timestamps
 _MEANING = (
-    "How late the total station's fixes are stamped against the joint readings of the bus, from fixes of the moving "
-    "boom, beyond the delay that the configuration states (link_delay_s). Motion shows only the difference of the two "
-    "delays: it is positive where the station is late, and negative where the bus is. The model is fitted to fixes of "
-    "the standing boom, which do not depend on it."
+    "Delay of the total station's timestamps relative to those of the joint readings on the bus, beyond the delay that "
+    "the configuration states (link_delay_s), estimated from fixes of the moving boom. Motion shows only the "
+    "difference of the two delays: it is positive if the station is late, and negative if the bus is late. The model "
+    "is fitted to fixes of the standing boom, which do not depend on this delay."
 )
 
 
 def timing(latencies: Mapping[str, Latency | str]) -> str:
-    """Return the section on latencies; empty where no session is told.
+    """Return the section on latencies; empty without sessions.
 
     Args:
-        latencies: session -> latency of its fixes, or why it is not known, a clause.
+        latencies: session -> latency of its fixes, or a clause that states why it is unknown.
     """
     if not latencies:
         return ""
@@ -60,4 +60,4 @@ def _advice(name: str, latency: Latency) -> str:
     size_ms, _ = _milliseconds(latency)
     if size_ms > 0.0:
         return f"In {name} the station is late by {size_ms:.0f} ms: add it to link_delay_s of its [[station]]."
-    return f"In {name} the bus is late by {-size_ms:.0f} ms: take it from link_delay_s of the [[station]]."
+    return f"In {name} the bus is late by {-size_ms:.0f} ms: subtract it from link_delay_s of the [[station]]."

@@ -1,4 +1,4 @@
-"""The plots of the gap report; each takes the workflow's answer and returns a figure."""
+"""The plots of the gap report; each takes the result of the workflow and returns a figure."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ if TYPE_CHECKING:
 
 BAND = "#e8f1f7"
 _TRACK = "#eef1f3"
-_LEAST_LEVER = 0.2  # of a joint's longest: what is nearer its axis says little of it
-_LEAST_REACH = 0.02  # of the longest of all joints of its kind: one that hardly moves the prism says nothing
-_SIDES = ((-1.0, "\N{DOWNWARDS ARROW}", -0.17), (1.0, "\N{UPWARDS ARROW}", 0.17))  # what the reading did last
+_LEAST_LEVER = 0.2  # of a joint's longest lever: a prism nearer to the axis shows little of the joint's error
+_LEAST_REACH = 0.02  # of the longest lever of all joints of its kind: fixes show nothing of a shorter one's error
+_SIDES = ((-1.0, "\N{DOWNWARDS ARROW}", -0.17), (1.0, "\N{UPWARDS ARROW}", 0.17))  # last change of the reading
 _COLUMNS = 3
-_VALUES = 0.36  # of the width, for the values in words
+_VALUES = 0.36  # share of the width for the values in words
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Stage:
 
 @dataclass(frozen=True)
 class Bar:
-    """One step of the way down to the noise: the effect added to the model, and the held-out error in mm."""
+    """One bar of `steps`: the effect added to the model, and the held-out error in mm."""
 
     label: str
     rms_mm: float
@@ -55,10 +55,10 @@ class Interval:
 
     Attributes:
         label: effect and coefficient.
-        value, error: in `unit`, one standard error.
-        sigma: plausible size.
-        lower, upper: bounds.
-        unit: for people.
+        value, error: fitted value and its standard error, in `unit`.
+        sigma: plausible size (1 sigma).
+        lower, upper: hard bounds.
+        unit: unit as the reader sees it.
     """
 
     label: str
@@ -71,7 +71,7 @@ class Interval:
 
 
 def stages(gap: GapResult) -> tuple[Stage, ...]:
-    """Return the errors of the calibrated kinematics and, where effects were adopted, of the same with them."""
+    """Return the errors of the calibrated kinematics and, if effects were adopted, those with the effects."""
     if not gap.effects:
         return (Stage(gap.error_before_mm, drawing.AFTER, "calibrated kinematics"),)
     return (
@@ -81,7 +81,7 @@ def stages(gap: GapResult) -> tuple[Stage, ...]:
 
 
 def steps(bars: Sequence[Bar], noise_mm: float) -> Figure:
-    """Draw the error from calibrated kinematics down towards the noise, a bar a round."""
+    """Draw the error from calibrated kinematics down towards the noise, one bar per round."""
     figure = drawing.new_figure(0.95 + 0.5 * len(bars))
     axes = figure.add_subplot()
     values = [bar.rms_mm for bar in bars]
@@ -159,7 +159,7 @@ def error_maps(gap: GapResult) -> Figure:
 
 
 def by_joint(gap: GapResult) -> Figure:
-    """Draw the error as each joint alone would have to make it, against the joint's own reading."""
+    """Draw the apparent error of each joint against the joint's own reading."""
     found = apparent(gap)
     joints = [joint for joint in gap.model.rig.joints if joint.name in found]
     lines = -(-len(joints) // _COLUMNS)
@@ -178,7 +178,7 @@ def by_joint(gap: GapResult) -> Figure:
 
 
 def by_direction(gap: GapResult) -> Figure | None:
-    """Draw the mean error of each joint by its direction of approach; None if no joint came from both sides."""
+    """Draw the mean error of each joint by its direction of approach; None if no joint moved in both directions."""
     found = apparent(gap)
     panels: dict[str, list[tuple[Joint, Apparent, Floats]]] = {}
     for joint in gap.model.rig.joints:
@@ -246,11 +246,11 @@ def by_prism(gap: GapResult) -> Figure:
 
 @dataclass(frozen=True)
 class Apparent:
-    """The error that a joint alone would need to explain the errors seen, in rows where it moves the prism enough.
+    """The error that a joint alone would need to explain all errors, in rows where it moves the prism enough.
 
     Attributes:
-        rows: index of them.
-        errors: of each stage, (rows,) mrad or mm.
+        rows: indices of these rows.
+        errors: (rows,) errors of each stage, mrad or mm.
     """
 
     rows: NDArray[np.intp]
@@ -258,7 +258,7 @@ class Apparent:
 
 
 def apparent(gap: GapResult) -> Mapping[str, Apparent]:
-    """Return each joint's apparent error: the least-squares share of the error along its motion of the prism."""
+    """Return each joint's apparent error: least squares of the error along the prism motion that the joint causes."""
     jacobian = Predictor.of(gap.model).linearise(gap.observations).joint_jacobian
     lengths = np.linalg.norm(jacobian, axis=1)  # mm per deg or mm
     kinds = np.array([joint.kind for joint in gap.model.rig.joints])

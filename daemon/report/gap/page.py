@@ -52,12 +52,12 @@ _COLUMNS = {
 
 
 def gap_report(gap: GapResult, sources: Mapping[str, str], facts: Facts | None = None) -> str:
-    """Return one self-contained HTML document, the same bytes for the same input.
+    """Return one self-contained HTML document; the same input gives the same bytes.
 
     Args:
-        gap: the workflow's answer.
+        gap: result of the workflow.
         sources: label -> origin of the data.
-        facts: the first lines of the report; by default what the rows say.
+        facts: the first lines of the report; derived from rows and model by default.
     """
     with drawing.styled():
         parts = [
@@ -99,12 +99,12 @@ def intervals(gap: GapResult) -> list[Interval]:
 
 
 def _size(coefficient: FittedCoefficient) -> float:
-    """Return the largest number of a coefficient and its interval: the unit is chosen for these, not for its bounds."""
+    """Return the larger of value and interval half-width; these determine the unit, the bounds do not."""
     return max(abs(coefficient.value), INTERVAL_SIGMAS * coefficient.standard_error)
 
 
 def coefficient_bounds(gap: GapResult, effect: FittedEffect) -> dict[str, tuple[float, float]]:
-    """Return coefficient -> its hard limits, if any: those it was weighed with, else the library's."""
+    """Return coefficient -> its finite hard limits: those of the comparison, else those of the library."""
     situation = EffectContext(gap.model.chain, gap.model.values, gap.observations)
     family = library()[effect.family]
     limits = {c.name: (c.lower, c.upper) for c in family.coefficients(situation, effect.where, effect.settings)}
@@ -141,18 +141,18 @@ def _head(gap: GapResult, facts: Facts) -> str:
 def _meaning(gap: GapResult) -> str:
     sentences = []
     if gap.verdict == "named":
-        sentences.append("It is part of the model now, fitted together with the lengths and angles.")
+        sentences.append("The model now includes what was missing, fitted together with the lengths and angles.")
     if gap.verdict == "indistinguishable":
-        sentences.append("None of them was added to the model; the measurements proposed below tell them apart.")
+        sentences.append("None of them was added to the model. The measurements proposed below distinguish them.")
         if gap.effects:
             named = spoken([(e.family, e.where) for e in gap.effects])
-            sentences.append(f"Certain already, and part of the model: {named}.")
+            sentences.append(f"Already certain, and part of the model: {named}.")
     if gap.description:
         sentences.append(f"{in_words(dependence(gap))}.")
     if gap.remaining_significant:
-        sentences.append(f"{remaining(gap)} that was not named; a learned residual may take it.")
+        sentences.append(f"{remaining(gap)} that was not named; a learned residual may absorb it.")
     elif gap.verdict in ("named", "none"):
-        sentences.append("What is left is what the noise explains.")
+        sentences.append("The noise explains the remaining error.")
     return " ".join(sentences)
 
 
@@ -162,8 +162,8 @@ def _steps(gap: GapResult) -> str:
     return markup.section(
         "From the simulation down to the noise",
         markup.paragraph(
-            "How far the simulation is off in poses that it was not fitted to, each time after the effect that the "
-            "data named was added. Where the bars reach the dashed line there is nothing left to find."
+            "Error of the simulation in poses that it was not fitted to, after each effect that was added. Where the "
+            "bars reach the dashed line, nothing is left to find."
         ),
         drawing.picture(
             figures.steps(list(bars(gap)), gap.noise_mm),
@@ -174,7 +174,7 @@ def _steps(gap: GapResult) -> str:
 
 
 def bars(gap: GapResult) -> Iterator[Bar]:
-    """Return the rounds as steps; a round's error is that before its own effects were adopted."""
+    """Yield a bar for each round; a round's error is the one before its own effects were adopted."""
     label = "calibrated kinematics"
     for number_, round_ in enumerate(gap.rounds):
         if number_ == 0 or gap.rounds[number_ - 1].adopted:
@@ -213,8 +213,8 @@ def _found(gap: GapResult) -> str:
     drawn = lines and drawing.picture(
         figures.coefficients(lines),
         "Coefficients with their intervals between their hard bounds",
-        "From one hard bound (black) to the other; light blue is what is plausible beforehand (1 sigma). The dot is "
-        "what was found, the line its 95 % interval.",
+        "Each bar spans the hard bounds (black); light blue is the range that is plausible beforehand (1 sigma). The "
+        "dot is the fitted value, the line its 95 % interval.",
     )
     names = dict.fromkeys(effect.family for effect in gap.effects)
     return markup.section(
@@ -231,11 +231,12 @@ def _where(gap: GapResult) -> str:
     rows = [[d.where, d.variable, chance(d.p)] for d in gap.disagreements]
     found = (
         markup.paragraph(
-            "Patterns in what calibrated kinematics leave, beyond chance; corrected for all that was looked at."
+            "Patterns in the residuals of the calibrated kinematics that chance does not explain, corrected for the "
+            "number of patterns tested."
         )
-        + markup.table(["where", "depends on", "by chance"], rows, text_columns=(0, 1))
+        + markup.table(["where", "depends on", "probability by chance"], rows, text_columns=(0, 1))
         if rows
-        else markup.paragraph("No pattern in what calibrated kinematics leave is beyond chance.")
+        else markup.paragraph("Chance explains every pattern in the residuals of the calibrated kinematics.")
     )
     content = [
         found,
@@ -249,8 +250,8 @@ def _where(gap: GapResult) -> str:
         drawing.picture(
             figures.by_joint(gap),
             "Apparent error of each joint against its reading",
-            "The error each joint would have to make, were it alone to blame, with running medians. A joint to blame "
-            "shows a curve; one beside it shows an echo.",
+            "The error each joint would have if it alone caused all errors, with running medians. A joint that causes "
+            "errors shows a curve; the joints next to it show an echo.",
         ),
     ]
     direction = figures.by_direction(gap)
@@ -279,7 +280,7 @@ def _where(gap: GapResult) -> str:
         ]
     content += [
         "<h3>By prism and component</h3>",
-        drawing.picture(figures.by_prism(gap), "Error by prism and by component", "Over all fixes, outliers too."),
+        drawing.picture(figures.by_prism(gap), "Error by prism and by component", "All fixes, including outliers."),
     ]
     return markup.section("Where simulation and measurement disagree", *content)
 
@@ -287,8 +288,8 @@ def _where(gap: GapResult) -> str:
 def _candidates(gap: GapResult) -> str:
     content = [
         markup.paragraph(
-            "Every effect of the library was weighed against all others and against none. The posterior probability is "
-            "the family's among all families; the Bayes factor compares the effect with no effect at all."
+            "Every effect of the library was compared with all others and with no effect. The posterior probability is "
+            "that of the family among all families. The Bayes factor compares the effect with no effect at all."
         )
     ]
     for place, round_ in enumerate(gap.rounds, start=1):
@@ -308,7 +309,7 @@ def _candidates(gap: GapResult) -> str:
 def _candidate_row(candidate: Candidate, place: int, gap: GapResult) -> list[str]:
     name = f"{candidate.family}@{candidate.where}"
     pending = any(name == f"{c.family}@{c.where}" for c in gap.indistinguishable)
-    verdict = candidate.reason or ("cannot be told apart" if pending else "")
+    verdict = candidate.reason or ("cannot be distinguished" if pending else "")
     for number_, round_ in enumerate(gap.rounds, start=1):
         if number_ >= place and name in round_.adopted:
             verdict = "adopted" if number_ == place else f"adopted in round {number_}"
@@ -333,8 +334,8 @@ def _not_shown(gap: GapResult) -> str:
     ]
     content = [
         markup.paragraph(
-            "An effect that is not named may be absent, or this data could not show it. Before any was weighed, it was "
-            "worked out what each would have looked like in these very poses."
+            "An effect that is not named may be absent, or these data could not show it. Before the comparison, it was "
+            "computed how each effect would appear in exactly these poses."
         )
     ]
     if hidden:
@@ -347,7 +348,7 @@ def _not_shown(gap: GapResult) -> str:
             ]
             for family, own in _by(hidden, lambda f: f.family).items()
         ]
-        columns = ["effect", "where", "share that calibration leaves", "at most, at a plausible size"]
+        columns = ["effect", "where", "share that calibration cannot absorb", "at most, at a plausible size"]
         content += [
             "<h3>Too small to be named, even at its hard bound</h3>",
             markup.table(columns, rows, text_columns=(0, 1)),
@@ -363,18 +364,21 @@ def _not_shown(gap: GapResult) -> str:
             for pair, own in _by(alike, lambda f: (f.family, f.alternative.partition("@")[0])).items()
         ]
         columns = ["effect", "where", "closest alternative", "share that the alternative cannot imitate"]
-        content += ["<h3>Hard to tell from another</h3>", markup.table(columns, rows, text_columns=(0, 1, 2))]
+        content += [
+            "<h3>Hard to distinguish from a different effect</h3>",
+            markup.table(columns, rows, text_columns=(0, 1, 2)),
+        ]
     if gap.disabled:
         content += [
-            "<h3>Not looked for</h3>",
+            "<h3>Not searched for</h3>",
             markup.items(
                 f"{family.replace('_', ' ')}: {in_words(reason)}" for family, reason in sorted(gap.disabled.items())
             ),
         ]
     seen = [f for f in gap.forecasts if math.isfinite(f.nameable)]
     if seen:
-        content.append(markup.details(f"What it could have shown ({len(seen)} effects)", _forecast_table(seen)))
-    return markup.section("What this data could not have shown", *content)
+        content.append(markup.details(f"What these data could have shown ({len(seen)} effects)", _forecast_table(seen)))
+    return markup.section("What these data could not have shown", *content)
 
 
 def _by(forecasts: Sequence[Forecast], key: Callable[[Forecast], _Key]) -> dict[_Key, list[Forecast]]:
@@ -407,10 +411,10 @@ def _forecast_table(forecasts: Sequence[Forecast]) -> str:
     columns = [
         "effect",
         "where",
-        "named from this size on",
+        "smallest size that would be named",
         "visible",
         "closest alternative",
-        "alternative cannot imitate",
+        "share that the alternative cannot imitate",
     ]
     return markup.table(columns, rows, text_columns=(0, 1, 4))
 
@@ -430,8 +434,8 @@ def _pose_table(poses: Sequence[Mapping[str, object]]) -> str:
     columns = list(dict.fromkeys(name for row in poses for name in row))
     rows = [[_cell(row.get(name, "")) for name in columns] for row in poses[:_POSES_SHOWN]]
     more = len(poses) - len(rows)
-    note = markup.paragraph(f"and {more} more; plan.csv beside this report has all of them", "note") if more else ""
-    return markup.table(columns, rows, caption="Next poses, as `rigcal plan` writes them") + note
+    note = markup.paragraph(f"and {more} more; plan.csv next to this report lists them all", "note") if more else ""
+    return markup.table(columns, rows, caption="Next poses, in the form that `rigcal plan` writes") + note
 
 
 def _cell(value: object) -> str:

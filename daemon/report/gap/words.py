@@ -1,4 +1,4 @@
-"""The gap workflow's answer in sentences, shared by its report, the commands and the jobs."""
+"""The result of the gap workflow in sentences, shared by its report, the commands and the jobs."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from daemon.report.words import number, place_name, spoken
 
 
 def gap_headline(gap: GapResult) -> str:
-    """Say the verdict in one sentence, and in a second one that held-out rows speak against it."""
+    """Return the verdict in one sentence; a second sentence warns if held-out rows contradict it."""
     if gap.raises_held_out and gap.held_out is not None:
         before, after = gap.held_out
         against = f"held-out rows fit worse with it, {number(after)} mm instead of {number(before)} mm"
@@ -22,22 +22,22 @@ def _verdict(gap: GapResult) -> str:
     if gap.verdict == "named":
         return f"The simulation lacked {spoken([(e.family, e.where) for e in gap.effects])}."
     if gap.verdict == "none":
-        but = f", but for {_outliers(gap)}: look at these first" if gap.model.outliers else ""
+        but = f", except for {_outliers(gap)}: check these first" if gap.model.outliers else ""
         return f"Simulation and measurement agree within the noise{but}."
     if gap.verdict == "indistinguishable":
         one_of = " or ".join(place_name(c.family, c.where) for c in gap.indistinguishable)
-        return f"The simulation lacks {one_of}: this data cannot tell which."
+        return f"The simulation lacks {one_of}: these data cannot show which."
     return "The simulation lacks something that no effect of the library explains."
 
 
 class ShownError(NamedTuple):
-    """The error that is shown for an answer.
+    """The error of the simulation that reports show.
 
     Attributes:
         before_mm: root mean square without the effects.
-        after_mm: with them.
-        rows: which fixes.
-        can_pass: nothing was fitted to these fixes, and none of them was left out.
+        after_mm: root mean square with the effects.
+        rows: words for the fixes, e.g. `on the held-out fixes`.
+        can_pass: True if nothing was fitted to these fixes and none of them was left out.
     """
 
     before_mm: float
@@ -60,18 +60,18 @@ def before_and_after(gap: GapResult) -> ShownError:
 
 
 def tolerance_verdict(gap: GapResult, tolerance_mm: float | None) -> Verdict | None:
-    """Hold the error with the effects against a tolerance; only rows that nothing was fitted to can pass, all of them.
+    """Compare the error with the effects to a tolerance; it can pass only on complete rows that nothing was fitted to.
 
     Args:
-        gap: the answer.
-        tolerance_mm: root mean square error that the machine may have; None where none is stated.
+        gap: result of the workflow.
+        tolerance_mm: permitted root mean square error; None if none is stated.
     """
     error = before_and_after(gap)
     return judge(tolerance_mm, error.after_mm, is_held_out=error.can_pass, rows=error.rows)
 
 
 def _outliers(gap: GapResult) -> str:
-    """Return how many outliers there are, and how far off."""
+    """Return the number of outliers and the largest deviation, in words."""
     worst = max(outlier.sigma for outlier in gap.model.outliers)
     some = f"{len(gap.model.outliers)} of {len(gap.observations)} fixes"
     return f"{some} that are up to {worst:,.0f} sigma off"
@@ -84,11 +84,11 @@ def closed_share(before_mm: float, after_mm: float, noise_mm: float) -> float | 
 
 
 def dependence(gap: GapResult) -> str:
-    """Say on what the structure depends that no effect of the library explains."""
-    subject = "What is left" if gap.effects else "It"
+    """Return a clause on what the structure that no effect of the library explains depends on."""
+    subject = "The remaining error" if gap.effects else "It"
     return f"{subject} depends on this: {gap.description}"
 
 
 def remaining(gap: GapResult) -> str:
-    """Say that structure is left; without its size if it is hidden in the noise of all rows together."""
+    """Return a clause stating that structure is left, without its size if the noise of all rows together hides it."""
     return f"Structure of {number(gap.remaining_mm)} mm is left" if gap.remaining_mm > 0.0 else "Structure is left"

@@ -72,7 +72,7 @@ def test_the_screen_fits_a_narrow_terminal_and_says_what_is_old() -> None:
     assert "theta3" in "".join(lines)
     assert any("30 s ago" in line for line in lines)
     whole = " ".join(line.strip() for line in lines)
-    assert "Move every joint to its target; the pose is measured by itself once the boom stands." in whole
+    assert "Move every joint to its target; the pose is measured automatically once the boom stands." in whole
     assert "Enter: Measure here" in whole
 
 
@@ -95,4 +95,4 @@ def test_off_a_terminal_targets_are_printed_and_a_warning_once_until_it_changes(
 def test_who_has_measured_all_is_told_that_the_jobs_need_nobody() -> None:
     awaiting = {"id": None, "jobs": 4, "is_acceptable": None, "refused_because": None}
     said = _after_all(awaiting)
-    assert said == "You may leave it: 4 jobs are still at work on the model; `rigcal jobs list` shows them."
+    assert said == "You may leave now: 4 jobs are still working on the model; `rigcal jobs list` shows them."

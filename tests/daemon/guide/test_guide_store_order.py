@@ -155,7 +155,7 @@ def test_a_guide_is_refused_at_once_while_a_shot_is_waited_for(rig: GuidedRig) -
 def test_no_session_is_started_beside_a_guide_that_is_being_opened(rig: GuidedRig) -> None:
     start = rig.guide.guarding("session.start", rig.keeper.start_command)
     rig.guided("start", new_setup={"id": "S1"}, prisms=["r"], poses=6, check_poses=0)
-    with pytest.raises(CommandError, match=r"session\.start is not carried out: guide 1 is open"):
+    with pytest.raises(CommandError, match=r"session\.start is refused: guide 1 is open"):
         start({"prism": "r"})
 
 

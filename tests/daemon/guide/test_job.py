@@ -173,7 +173,7 @@ def test_the_prisms_of_a_guide_share_the_poses_that_a_calibration_needs() -> Non
 def test_it_is_enough_when_the_target_is_reached_or_little_is_to_gain() -> None:
     much, little = Forecast(2.0, 2.0, 1.5), Forecast(2.0, 2.0, 1.95)
     assert stop_reason(much, None, 20) == ""
-    assert "by 3% only" in stop_reason(little, None, 20)
+    assert "by only 3%" in stop_reason(little, None, 20)
     assert "target of 2.5 mm" in stop_reason(much, 2.5, 20)
     assert stop_reason(much, 1.9, 20) == ""
     assert stop_reason(little, None, LEAST_POSES - 1) == ""

@@ -36,5 +36,5 @@ def test_a_process_that_ends_in_the_midst_of_an_answer_is_told_to_who_has_asked(
         link.ask({"do": "plan"}, take)
         assert told.wait(10.0)
         wait_until(lambda: not link.is_alive)
-    assert answers == [{"error": "the process of the gain meter has ended; it is started again"}]
+    assert answers == [{"error": "the gain meter's process has ended; it is being restarted"}]
     assert ended.found() == {}

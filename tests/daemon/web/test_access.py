@@ -146,7 +146,7 @@ def test_a_computer_knows_its_own_names(host: str, name: str, is_own: bool) -> N
 
 def test_another_address_needs_tls(tmp_path: Path) -> None:
     socket, tokens = tmp_path / "control.sock", tmp_path / "tokens.json"
-    with pytest.raises(CommandError, match="needs TLS"):
+    with pytest.raises(CommandError, match="use TLS"):
         WebSettings(socket, tokens, host="0.0.0.0").check()
     with pytest.raises(CommandError, match="cannot be read"):
         WebSettings(socket, tokens, certificate=tmp_path / "none.pem", key=tmp_path / "none.pem").check()

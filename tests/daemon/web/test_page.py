@@ -213,7 +213,7 @@ def test_who_signs_in_is_kept_with_what_is_done(config: Path, daemon: Config, pa
 def test_other_computers_need_tls_and_a_token(config: Path, tmp_path: Path) -> None:
     refused = rigcal("web", "--config", str(config), "--host", "0.0.0.0")
     assert refused.returncode == 2
-    assert "needs TLS" in refused.stderr
+    assert "use TLS" in refused.stderr
     certificate, key = self_signed(tmp_path)
     web = WebProcess(config, "--host", "0.0.0.0", "--certificate", str(certificate), "--key", str(key))
     try:

@@ -1,4 +1,4 @@
-// Alarms, each with what to do; and, where the page can do it, a button.
+// Alarms, each with its remedy, and with a button if the page can carry it out.
 
 import { h } from "./dom.js";
 import { duration, words } from "./words.js";
@@ -13,9 +13,9 @@ export function alarmList(now, app) {
   const late = looked * (now.time.real_s_per_s || 1) > 30;
   return [
     h("h2", { id: "alarms-title" }, active.length ? `Alarms (${active.length})` : "No alarms"),
-    late ? h("p", { class: "bad" }, `The daemon is held up: alarms were last looked at ${duration(looked)} ago.`) : null,
+    late ? h("p", { class: "bad" }, `The daemon is delayed: alarms were last checked ${duration(looked)} ago.`) : null,
     Object.entries(now.unreadable).map(([part, why]) => h("p", { class: "bad" }, `${words(part)} cannot be read from the store: ${why}`)),
-    active.length ? h("ul", { class: "alarms" }, active.map((alarm) => alarmItem(alarm, app))) : h("p", { class: "soft" }, "Everything that rigcal watches is well."),
+    active.length ? h("ul", { class: "alarms" }, active.map((alarm) => alarmItem(alarm, app))) : h("p", { class: "soft" }, "Everything that rigcal monitors is in order."),
   ];
 }
 

@@ -1,4 +1,4 @@
-// Questions to the web process. Every failure is an Error whose message is a sentence for the operator.
+// Requests to the web process. Every failure is an Error whose message is a sentence for the operator.
 
 export class ApiError extends Error {
   constructor(message, status) {
@@ -28,7 +28,7 @@ export const post = (path, body) => answer(fetch(path, {
   body: JSON.stringify(body),
 }));
 
-/** The name that someone without a token has given; it is kept in this browser. */
+/** The name that a person without a token has entered; it is stored in this browser. */
 export const operator = {
   get name() { try { return localStorage.getItem("operator") ?? ""; } catch { return ""; } },
   set name(name) { try { localStorage.setItem("operator", name); } catch { /* private browsing: asked again */ } },

@@ -1,4 +1,4 @@
-// The frame of the page: who is there, what is connected, which screen is shown.
+// The frame of the page: the person, the connection, and the screen.
 
 import { ApiError, command, get, operator } from "./api.js";
 import { askName, confirm, signIn } from "./dialogs.js";
@@ -69,7 +69,7 @@ class App {
     const { live } = this;
     if (!live) return;
     document.body.dataset.live = live.isLive ? "yes" : "no";
-    const since = live.state && live.age > OLD_S ? `; what is shown is ${duration(live.age)} old` : "";
+    const since = live.state && live.age > OLD_S ? `; the data shown are ${duration(live.age)} old` : "";
     this.#connection(live.isLive ? "live" : `${live.trouble}${since}`, live.isLive);
     if (live.state) {
       say($("rig"), live.state.rig);
@@ -100,7 +100,7 @@ class App {
 
   // ---- commands ----------------------------------------------------------------------------------------------------
 
-  /** Carry out a command and say what came of it; null where it failed. */
+  /** Carry out a command and show its result; null if it failed. */
   async run(name, args, done = "Done") {
     try {
       const result = await command(name, args);
@@ -113,7 +113,7 @@ class App {
     }
   }
 
-  /** Ask, then carry out. `about` is a list of sentences: the reasons. */
+  /** Ask for confirmation. `about` is a list of sentences: the reasons. */
   confirm(title, about, button, options) { return confirm($("dialog"), title, about, button, options); }
 
   toast(text, bad = false) {
@@ -124,7 +124,7 @@ class App {
     this.toasting = setTimeout(() => { toast.className = "toast"; toast.textContent = ""; }, bad ? 12000 : 5000);
   }
 
-  /** A button that sends a command; null for somebody whose role does not reach. */
+  /** A button that sends a command; null for a person whose role is too low. */
   button(text, role, act, kind = "") {
     if (!this.may(role)) return null;
     return h("button", { type: "button", class: kind, "data-key": text, onclick: async (event) => {
@@ -135,7 +135,7 @@ class App {
     } }, text);
   }
 
-  /** A value with its age: grey and labelled once its evidence is older than 2 s, or the page is not live. */
+  /** A value with its age: grey and labelled once its data are older than 2 s, or the page is not live. */
   aged(element, text, age) {
     const old = age === null || age > OLD_S || !this.live.isLive;
     element.classList.toggle("old", old);
@@ -147,7 +147,7 @@ class App {
   #listen() {
     addEventListener("popstate", () => {
       const name = location.pathname.slice(1) || "now";
-      if (name !== this.name) this.show(name, { focus: true });  // else a link within the screen was followed
+      if (name !== this.name) this.show(name, { focus: true });  // otherwise a link within the screen was followed
     });
     document.addEventListener("click", (event) => {
       const link = event.target.closest("a[href]");

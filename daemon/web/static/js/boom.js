@@ -5,7 +5,7 @@ import { s } from "./dom.js";
 const WIDTH = 560, HEIGHT = 330, MARGIN = 34;
 const SAMPLES = 240;
 
-/** Points of a chain at some joint values: the origin, the place after each shift, and last the prism, mm. */
+/** Points of a chain at given joint values, mm: the origin, the place after each translation, and finally the prism. */
 export function walk(chain, values) {
   let rotation = [[1, 0, 0], [0, 1, 0], [0, 0, 1]];
   let place = [0, 0, 0];
@@ -33,7 +33,7 @@ function turned(rotation, axis, angle) {
   });
 }
 
-/** Two views of a rig, which `draw` brings up to date. */
+/** Two views of a rig, which `draw` updates. */
 export class Boom {
   constructor(shape) {
     this.shape = shape;
@@ -42,7 +42,7 @@ export class Boom {
     this.plan = this.#view("Plan view", (p) => [p[0], p[1]]);
   }
 
-  /** Draw where the boom is and, where there is one, where it should be: joint values in the rig's order. */
+  /** Draw the boom now and its target, if there is one: joint values in the rig's order. */
   draw(now, target, isOld) {
     for (const view of [this.side, this.plan]) {
       view.svg.classList.toggle("old", isOld);
@@ -50,8 +50,8 @@ export class Boom {
       this.#chains(view, view.there, target, "there");
     }
     const words = [now && `the boom reaches ${this.#where(now)}`, target && `its target ${this.#where(target)}`].filter(Boolean).join("; ");
-    this.side.svg.setAttribute("aria-label", `Side view: ${words || "the joints are not known"}`);
-    this.plan.svg.setAttribute("aria-label", `Plan view: ${words || "the joints are not known"}`);
+    this.side.svg.setAttribute("aria-label", `Side view: ${words || "the joint readings are unknown"}`);
+    this.plan.svg.setAttribute("aria-label", `Plan view: ${words || "the joint readings are unknown"}`);
   }
 
   // ---- geometry ----------------------------------------------------------------------------------------------------
@@ -118,7 +118,7 @@ export class Boom {
   }
 }
 
-/** Range of a coordinate that holds the base and nearly all places that the boom reaches. */
+/** Range of a coordinate that contains the base and nearly all places that the boom reaches. */
 function extent(points, coordinate) {
   const sorted = points.map((p) => p[coordinate]).toSorted((a, b) => a - b);
   const at = (share) => sorted[Math.round(share * (sorted.length - 1))];

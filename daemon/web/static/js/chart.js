@@ -1,4 +1,4 @@
-// Charts over time by uPlot, in the colours of the page, each with the same figures as a table for those who do not see it.
+// Charts over time by uPlot, in the colours of the page, each with a table of the same figures for people who cannot see it.
 
 import { fill, h } from "./dom.js";
 
@@ -6,7 +6,7 @@ let library = null;
 const loaded = () => (library ??= import("/static/vendor/uplot/uPlot.esm.js").then((module) => module.default));
 const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim();
 
-/** Instants of a time axis, in UTC: days where the ticks are days apart, else times. */
+/** Labels of a time axis in UTC: dates if the ticks are days apart, else times. */
 const times = (_plot, ticks, _axis, _space, apart) => ticks.map((tick) => {
   const text = new Date(tick * 1e3).toISOString();
   return apart >= 86400 ? text.slice(0, 10) : text.slice(11, apart >= 60 ? 16 : 19);
@@ -14,11 +14,11 @@ const times = (_plot, ticks, _axis, _space, apart) => ticks.map((tick) => {
 
 /**
  * A chart of points over time.
- * @param label what it shows, for those who cannot see it
- * @param unit of the values
+ * @param label description of the chart for people who cannot see it
+ * @param unit unit of the values
  * @param series list of {label, colour (name of a page colour), line (bool)}
- * @param empty what to say in place of a chart that has nothing to show; "" where the page says it already
- * @param options log: logarithmic values; from: smallest value of the axis
+ * @param empty text in place of a chart without data; "" if the page explains this already
+ * @param options log: logarithmic axis; zero: the axis includes zero
  */
 export class Chart {
   constructor(label, unit, series, empty, { log = false, zero = true } = {}) {
@@ -34,13 +34,13 @@ export class Chart {
     this.show([[], ...series.map(() => [])]);
   }
 
-  /** Show data: [times in s of UTC, values of each series ...]; null where a series has none. */
+  /** Show data: [times in s of UTC, values of each series ...]; null for a missing value. */
   show(data) {
     const key = JSON.stringify(data);
     if (key === this.key) return;
     this.key = key;
     this.data = data;
-    // A dashed line alone is a limit that nothing is compared with yet.
+    // A dashed line alone is a limit without values to compare.
     this.isEmpty = !this.series.some((each, i) => !each.dash && data[i + 1].some((value) => value !== null));
     this.box.hidden = this.isEmpty;
     this.empty.hidden = !this.isEmpty;

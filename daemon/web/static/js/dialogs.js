@@ -1,4 +1,4 @@
-// Dialogs: confirmation with reasons, signing in, and who somebody is. A dialog keeps the focus and Escape closes it.
+// Dialogs: confirmation with reasons, signing in, and the person's name. A dialog keeps the focus and Escape closes it.
 
 import { operator, post } from "./api.js";
 import { h } from "./dom.js";
@@ -10,10 +10,10 @@ function opened(dialog, content) {
 }
 
 /**
- * Ask before something is done.
- * @param reasons sentences that speak for and against it
+ * Ask for confirmation of an action.
+ * @param reasons sentences for and against it
  * @param options kind of the button; `reason` asks for a text, with choices to tap
- * @returns null where it was not confirmed, else the reason ("" where none is asked for)
+ * @returns null if it was not confirmed, else the reason ("" if none is required)
  */
 export async function confirm(dialog, title, reasons, button, { kind = "main", reason = null } = {}) {
   let answer = null;
@@ -30,7 +30,7 @@ export async function confirm(dialog, title, reasons, button, { kind = "main", r
   return answer;
 }
 
-/** Ask for a token until there is one that counts; nothing of the page is shown before. */
+/** Ask for a token until a valid one is entered; the page shows nothing before. */
 export async function signIn(dialog) {
   for (;;) {
     let person = null;
@@ -44,14 +44,14 @@ export async function signIn(dialog) {
       } catch (error) { fault.textContent = error.message; }
     } },
     h("h2", { id: "dialog-title" }, "Sign in to this rig"),
-    h("label", { for: "token" }, "Token", h("span", { class: "soft" }, "Whoever looks after rigcal gives you one."), token),
+    h("label", { for: "token" }, "Token", h("span", { class: "soft" }, "You get one from the administrator of rigcal."), token),
     fault,
     h("div", { class: "row" }, h("button", { class: "main" }, "Sign in"))));
     if (person !== null) return person;
   }
 }
 
-/** Show who somebody is: change the name, sign in or out. Returns true if the page must be loaded anew. */
+/** Show who the person is: change the name, sign in or out. Returns true if the page must be reloaded. */
 export async function askName(dialog, me) {
   let changed = false;
   const name = h("input", { id: "name", maxlength: "60", autocomplete: "name", value: operator.name || me.local_user || "" });
@@ -65,10 +65,10 @@ export async function askName(dialog, me) {
     } catch (error) { fault.textContent = error.message; }
   };
   const body = me.by_token
-    ? h("p", null, `You are ${me.name}, with the role ${me.role}. What you do is kept with this name.`)
+    ? h("p", null, `You are ${me.name}, with the role ${me.role}. Your actions are recorded under this name.`)
     : [
       h("p", null, `You opened this page without a token and have the role ${me.role}.`),
-      h("label", { for: "name" }, "Your name", h("span", { class: "soft" }, "kept with what you do"), name),
+      h("label", { for: "name" }, "Your name", h("span", { class: "soft" }, "recorded with your actions"), name),
       h("label", { for: "token" }, "Token", h("span", { class: "soft" }, "only if you want to sign in as someone else"), token),
     ];
   await opened(dialog, h("form", { onsubmit: (event) => {

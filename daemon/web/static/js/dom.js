@@ -1,4 +1,4 @@
-// Elements from text and data. Nothing here, or anywhere on the page, makes HTML of strings.
+// Elements from text and data. No code of the page makes HTML from strings.
 
 const SVG = "http://www.w3.org/2000/svg";
 
@@ -12,20 +12,20 @@ function made(element, attributes, children) {
   return element;
 }
 
-/** An HTML element; attributes that begin with "on" are listeners, null and false are left out. */
+/** An HTML element; attributes that begin with "on" are listeners; null and false are omitted. */
 export const h = (tag, attributes, ...children) => made(document.createElement(tag), attributes, children);
 
 /** An SVG element. */
 export const s = (tag, attributes, ...children) => made(document.createElementNS(SVG, tag), attributes, children);
 
-/** Set a text only where it is another: what is read aloud, selected or focused stays undisturbed. */
+/** Set a text only if it has changed, so that screen readers, selection and focus are not disturbed. */
 export function say(element, text) {
   if (element.textContent !== text) element.textContent = text;
 }
 
 const keys = new WeakMap();
 
-/** Fill an element anew, but only when its key is another than the last time. */
+/** Fill an element again, but only if its key has changed since the last time. */
 export function fill(element, key, build) {
   const text = JSON.stringify(key);
   if (keys.get(element) === text) return;
@@ -50,7 +50,7 @@ export function table(caption, columns, rows) {
 export const tile = (label, value, unit = "", below = "") =>
   h("div", { class: "tile" }, h("dt", null, label), h("dd", null, value, unit && h("small", null, ` ${unit}`)), below && h("dd", null, h("p", null, below)));
 
-/** A bar that shows a share from 0 to 1, with marks at further shares. */
+/** A bar that is filled between two shares, 0 to 1. */
 export function bar(label, from, to) {
   const at = (share) => `${(100 * Math.min(Math.max(share, 0), 1)).toFixed(1)}%`;
   const width = Math.max(Math.min(to, 1) - Math.max(from, 0), 0);

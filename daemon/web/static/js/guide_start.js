@@ -1,4 +1,4 @@
-// The form that starts a guide: all of it is filled in, so that one tap is enough.
+// The form that starts a guide: all fields are filled in, so that one tap is enough.
 
 import { command, get } from "./api.js";
 import { h } from "./dom.js";
@@ -6,14 +6,14 @@ import { h } from "./dom.js";
 export function startForm(app, now) {
   const card = h("section", { class: "card", "aria-labelledby": "start-title" }, h("h2", { id: "start-title" }, "Start a guided session"));
   if (!app.may("operate")) {
-    card.append(h("p", { class: "soft" }, "An operator starts it; you see here where it leads."));
+    card.append(h("p", { class: "soft" }, "An operator starts it; you can follow its progress here."));
     return card;
   }
   if (now.session) {
     card.append(h("p", null, `Session ${now.session.id} is open; it must be ended before a guide starts.`), h("a", { class: "button", href: "/session" }, "Go to the session"));
     return card;
   }
-  const body = h("p", { class: "soft" }, "Looking at what is known of the rig\u2026");
+  const body = h("p", { class: "soft" }, "Reading the data of the rig\u2026");
   card.append(body);
   Promise.all([command("setup.list"), get("/api/rig")])
     .then(([setups, shape]) => body.replaceWith(form(app, setups, shape)), (error) => body.replaceWith(h("p", { class: "fault" }, error.message)));
@@ -39,7 +39,7 @@ function form(app, setups, shape) {
   const choose = (event) => { anew.hidden = event.target.value !== "new"; };
   const where = h("fieldset", { onchange: choose }, h("legend", null, "Where does the station stand?"),
     stands ? h("label", { class: "choice" }, radio("same", true), `As before: set-up ${current.id}`) : null,
-    h("label", { class: "choice" }, radio("new", !stands), current ? "It was moved or set up anew" : "It was set up just now"), anew);
+    h("label", { class: "choice" }, radio("new", !stands), current ? "It was moved or set up again" : "It was just set up"), anew);
 
   async function start(event) {
     event.preventDefault();
@@ -59,6 +59,6 @@ function form(app, setups, shape) {
     h("button", { class: "huge main" }, "Start"), fault, where,
     h("fieldset", null, h("legend", null, "Which prisms?"), h("div", { class: "choices" }, prisms)),
     h("div", { class: "pair" },
-      h("label", { for: "points" }, "Control points", h("span", { class: "soft" }, "points that stand still beside the rig"), points),
-      h("label", { for: "target" }, "Target in mm", h("span", { class: "soft" }, "leave it empty to go on while poses still help"), target)));
+      h("label", { for: "points" }, "Control points", h("span", { class: "soft" }, "fixed points near the rig"), points),
+      h("label", { for: "target" }, "Target in mm", h("span", { class: "soft" }, "leave empty to continue as long as poses help"), target)));
 }

@@ -1,20 +1,20 @@
-// Jobs in words: what they do, how far they are, what came of them.
+// Jobs in words: their purpose, progress and result.
 
 import { bar, h } from "./dom.js";
 import { JOBS, words } from "./words.js";
 
 export const jobName = (job) => JOBS[job.kind] ?? words(job.kind);
 
-/** One line: name, state, and the error where there is one. */
+/** One line: name, state, and the error if there is one. */
 export function jobLine(job) {
   const state = job.state === "running" ? `running, ${Math.floor(100 * job.progress)} %: ${job.message || "starting"}` : job.state;
   return `${jobName(job)} (job ${job.id}): ${state}${job.error ? `, ${job.error}` : ""}`;
 }
 
-/** A job with its progress, and what may be done about it. */
+/** A job with its progress and its buttons. */
 export function jobCard(job, app) {
   const cancel = async () => {
-    const go = await app.confirm(`Cancel ${jobName(job).toLowerCase()}?`, ["The jobs that wait for it are cancelled too.", "It can be tried again later."], "Cancel the job", { kind: "danger" });
+    const go = await app.confirm(`Cancel ${jobName(job).toLowerCase()}?`, ["Jobs that depend on it are cancelled too.", "It can be retried later."], "Cancel the job", { kind: "danger" });
     if (go !== null) await app.run("jobs.cancel", { id: job.id });
   };
   const isOpen = ["running", "queued", "interrupted"].includes(job.state);

@@ -1,15 +1,15 @@
-// The live state: one stream of events, opened again whenever it breaks, and how old what is shown is.
+// The live state: one stream of events, reopened whenever it breaks, and the age of the data shown.
 
-const SILENT_MS = 2000; // no event for so long: what is shown is not live
-const REOPEN_MS = 5000; // ... for so long: the stream is opened again
+const SILENT_MS = 2000; // after this time without an event the data shown are not live
+const REOPEN_MS = 5000; // after this time without an event the stream is reopened
 const RETRY_MS = 1000;
 
 export class Live {
   /** @param {{onState: Function, onRefused: Function}} listeners */
   constructor({ onState, onRefused }) {
     this.state = null;
-    this.receivedAt = -Infinity; // of the last state of the daemon
-    this.heardAt = performance.now(); // of the last event
+    this.receivedAt = -Infinity; // time of the last state of the daemon
+    this.heardAt = performance.now(); // time of the last event
     this.trouble = "connecting";
     this.onState = onState;
     this.onRefused = onRefused;
@@ -20,10 +20,10 @@ export class Live {
     this.open();
   }
 
-  /** True if what is shown is of now. */
+  /** True if the data shown are current. */
   get isLive() { return this.trouble === null; }
 
-  /** Seconds since the last state came. */
+  /** Seconds since the last state arrived. */
   get age() { return (performance.now() - this.receivedAt) / 1000; }
 
   open() {
@@ -43,7 +43,7 @@ export class Live {
     try {
       const response = await fetch("/api/me", { credentials: "same-origin" });
       if (response.ok && (await response.json()).role === null) { this.onRefused(); return; }
-    } catch { /* still lost: the stream tells */ }
+    } catch { /* still lost: the stream reports it */ }
     this.open();
   }
 
@@ -67,7 +67,7 @@ export class Live {
     if (silent > REOPEN_MS) this.open();
   }
 
-  /** Real seconds since something that was `age` seconds old, on the daemon's clock, when the state was made. */
+  /** Present age, in real seconds, of data that were `age` seconds old on the daemon's clock when the state was made. */
   ageOf(age) {
     if (age === null || age === undefined) return null;
     return age * (this.state?.time.real_s_per_s || 1) + this.age;

@@ -1,4 +1,4 @@
-// Colours: those of the system until someone has chosen others. Runs before the page is drawn, so that nothing flashes.
+// Colours: those of the system until the person chooses others. Runs before the page is drawn, so that nothing flashes.
 (() => {
   const dark = matchMedia("(prefers-color-scheme: dark)");
   const chosen = () => { try { return localStorage.getItem("theme"); } catch { return null; } };

@@ -15,20 +15,20 @@ export function duration(seconds) {
 export const fixed = (value, digits) =>
   value === null || value === undefined || !Number.isFinite(value) ? "\u2013" : value.toFixed(digits).replace("-", MINUS);
 
-/** A value of a joint, with the decimals that its unit deserves. */
+/** A value of a joint, with decimals that suit its unit. */
 export const measured = (value, unit) => fixed(value, unit === "mm" ? 0 : 1);
 
 export const unitName = (unit) => ({ deg: "\u00b0", degC: " \u00b0C" }[unit] ?? ` ${unit}`);
 
 export const percent = (share) => (share === null || share === undefined ? "\u2013" : `${(100 * share).toFixed(0)} %`);
 
-/** An error in mm: two digits that count. */
+/** An error in mm, with two decimals, fewer from 10 mm on. */
 export function millimetres(value) {
   if (value === null || value === undefined || !Number.isFinite(value)) return "\u2013";
   return value >= 100 ? value.toFixed(0) : value >= 10 ? value.toFixed(1) : value.toFixed(2);
 }
 
-/** Nanoseconds of UTC for people, in UTC. */
+/** A UTC timestamp in nanoseconds as text. */
 export function utc(ns) {
   if (ns === null || ns === undefined) return "\u2013";
   return `${new Date(ns / 1e6).toISOString().slice(0, 16).replace("T", " ")} UTC`;
@@ -38,11 +38,11 @@ export const words = (name) => String(name).replaceAll("_", " ").replaceAll("-",
 
 export const plural = (n, one, more = `${one}s`) => `${n} ${n === 1 ? one : more}`;
 
-/** Poses of a guide's plan as a tile; a session has measured more where the boom stood elsewhere too. */
-export const planned = ({ done, planned: all, skipped }) => ["Planned poses", `${done} of ${all}`, "", skipped ? `${skipped} skipped` : "reached as the guide asks"];
+/** Poses of a guide's plan as a tile; a session has more poses if the boom also stood elsewhere. */
+export const planned = ({ done, planned: all, skipped }) => ["Planned poses", `${done} of ${all}`, "", skipped ? `${skipped} skipped` : "as the guide requests"];
 
 export const JOBS = { gap: "Identification", residual: "Learning what remains", report: "Report", comparison: "Comparison", drift: "Drift of checks" };
 
-/** A clause as a sentence of its own: with a capital, unless it begins with a name, and a full stop. */
+/** A clause as a sentence: with a capital, unless it begins with a name, and a full stop. */
 export const sentence = (clause) =>
   clause && `${clause.replace(/^[a-z]{2,}(?=[ ,])/, (word) => word[0].toUpperCase() + word.slice(1))}${/[.?!]$/.test(clause) ? "" : "."}`;

@@ -63,7 +63,7 @@ def outline(document: str) -> Outline:
 def test_report_has_every_section(outline: Outline) -> None:
     assert outline.headings == [
         "How accurate the model is",
-        "What is left, joint by joint",
+        "Remaining error, joint by joint",
         "Where it was measured",
         "What was corrected",
         "Fixes set aside",
@@ -95,7 +95,7 @@ def test_named_effects_have_a_section_with_their_sizes() -> None:
 def test_the_features_of_trees_are_shown_by_their_importance() -> None:
     shares = [("prism_x_mm", 0.4), *((f"valve{k}_mA", 0.05) for k in range(12))]
     outline = Outline(calibration_report(report_input(importance=shares)))
-    assert "What the learned residual looks at" in outline.headings
+    assert "Features of the learned residual" in outline.headings
     assert "The 10 most important of the 13 features of the trees." in outline.text
     assert len(outline.pictures) == 7
     drawing = base64.b64decode(outline.pictures[-2]["src"].partition("base64,")[2], validate=True)
@@ -154,7 +154,7 @@ def test_text_says_what_an_operator_must_know(outline: Outline) -> None:
         "The data determine 54 of 56 parameters",
         "row 9, zero angle with prism s, offset along x",
         "beyond building: check the drawing",  # row1.alpha, 4.5 tolerances
-        "1 of 60 fixes (1.7 %) did not fit",
+        "1 of 60 fixes (1.7 %) did not agree",
         "operator_note",
         "2026-11-21 14:03 UTC",
         "+0.30, \N{MINUS SIGN}0.40, 0 0.50",  # a misclosure and its size
@@ -165,7 +165,7 @@ def test_text_says_what_an_operator_must_know(outline: Outline) -> None:
 def test_report_without_held_out_fixes_says_it_is_about_the_fitted_ones() -> None:
     outline = Outline(calibration_report(report_input("ur10", held_out=False, learned=False, setups=[])))
     assert "On the 60 fixes it was fitted to" in outline.text
-    assert "not a promise of accuracy" in outline.text
+    assert "not the accuracy to expect" in outline.text
     assert "Learned residual: none helps on held-out groups." in outline.text
     assert "Station set-ups" not in outline.headings
 

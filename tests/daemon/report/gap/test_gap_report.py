@@ -47,7 +47,7 @@ def test_what_leaves_fixes_out_does_not_pass_and_says_so() -> None:
     with_outliers = replace(gap, model=replace(gap.model, outliers=(Outlier(3, 120.0), Outlier(9, 4000.0))))
     verdicts = [tolerance_verdict(found, 1e3) for found in (gap, with_outliers)]
     assert [verdict and verdict.outcome for verdict in verdicts] == ["passed", "not judged"]
-    assert "but for 2 of 120 fixes that are up to 4,000 sigma off" in gap_headline(with_outliers)
+    assert "except for 2 of 120 fixes that are up to 4,000 sigma off" in gap_headline(with_outliers)
     shared = replace(gap, held_out=(2.0, 2.0), shared=4)
     assert [(v := tolerance_verdict(g, 1e3)) and v.outcome for g in (shared, replace(shared, shared=0))] == [
         "not judged",
@@ -61,7 +61,7 @@ def test_the_report_of_a_named_effect_has_every_section(named: Outline) -> None:
         "What was missing",
         "Where simulation and measurement disagree",
         "Candidates, and why they were rejected",
-        "What this data could not have shown",
+        "What these data could not have shown",
         "What to measure next",
         "Where this comes from",
     ]
@@ -81,7 +81,7 @@ def test_it_is_one_file_that_loads_nothing(document: str, named: Outline) -> Non
         (support.nothing, "Simulation and measurement agree within the noise."),
         (
             support.pending,
-            "The simulation lacks encoder harmonic at theta4 or backlash at theta5: this data cannot tell",
+            "The simulation lacks encoder harmonic at theta4 or backlash at theta5: these data cannot show",
         ),
         (support.unidentified, "The simulation lacks something that no effect of the library explains."),
     ],
@@ -150,10 +150,10 @@ def test_rivals_stand_with_their_odds_and_why_they_were_rejected(named: Outline)
 
 
 def test_what_the_data_could_not_have_shown_is_said_by_effect(named: Outline) -> None:
-    text = named.text.partition("What this data could not have shown")[2]
+    text = named.text.partition("What these data could not have shown")[2]
     for words in (
         "Too small to be named", "boom droop", "station scale", "thermal expansion: needs the column temperature_degC",
-        "latency: these poses show nothing of it", "What it could have shown (2 effects)", "260 microradians",
+        "latency: these poses show nothing of it", "What these data could have shown (2 effects)", "260 microradians",
     ):  # fmt: skip
         assert words in text
 
@@ -161,7 +161,7 @@ def test_what_the_data_could_not_have_shown_is_said_by_effect(named: Outline) ->
 def test_a_set_has_the_poses_that_separate_it_and_no_effect_table(pending: Outline) -> None:
     assert "What was missing" not in pending.headings
     for words in (
-        "cannot tell which", "Measure these 3 poses.", "Approach each pose once from below", "theta4_deg", "r s",
+        "cannot show which", "Measure these 3 poses.", "Approach each pose once from below", "theta4_deg", "r s",
     ):  # fmt: skip
         assert words in pending.text
 

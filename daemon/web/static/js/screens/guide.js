@@ -1,4 +1,4 @@
-// Guide: the step to do now, the boom where it is and where it should go, and what is still to gain.
+// Guide: the step to do now, the boom and its target, and the gain to expect.
 
 import { get } from "../api.js";
 import { Boom } from "../boom.js";
@@ -8,7 +8,7 @@ import { startForm } from "../guide_start.js";
 import { duration, measured, millimetres, percent, plural, sentence, unitName, words } from "../words.js";
 
 const WHY_SKIP = ["Out of the station's sight", "Not reachable here", "Not safe here"];
-const WHY_STOP = ["The station has moved", "The work goes on", "Something is broken"];
+const WHY_STOP = ["The station has moved", "The rig is needed for work", "Something is broken"];
 
 export function mount(root, app) {
   const page = h("div");
@@ -35,7 +35,7 @@ function startPage(app, now) {
   const last = guide && h("section", { class: "card" },
     h("h2", null, guide.state === "finished" ? "The last guide is finished" : "The last guide was abandoned"),
     h("p", null, guide.state === "finished"
-      ? guide.model?.id ? `Model ${guide.model.id} came of it.` : "Its model is being made; the screen Now says when it is ready."
+      ? guide.model?.id ? `It produced model ${guide.model.id}.` : "Its model is being made; the screen Now shows when it is ready."
       : guide.step?.instruction ?? ""));
   return h("div", { class: "stack" }, last, startForm(app, now));
 }
@@ -65,8 +65,8 @@ function openGuide(app) {
       h("section", { class: "card", "aria-labelledby": "joints-title" }, h("h2", { id: "joints-title" }, "Joint by joint"), joints)),
     h("div", { class: "stack" },
       h("section", { class: "card stack", "aria-labelledby": "boom-title" }, h("h2", { id: "boom-title" }, "The boom"),
-        h("p", { class: "key" }, h("span", null, "where it is"), h("span", null, "where to go")), views),
-      h("section", { class: "card", "aria-labelledby": "gain-title" }, h("h2", { id: "gain-title" }, "What there is to gain"), gain),
+        h("p", { class: "key" }, h("span", null, "position now"), h("span", null, "target")), views),
+      h("section", { class: "card", "aria-labelledby": "gain-title" }, h("h2", { id: "gain-title" }, "Expected gain"), gain),
       h("section", { class: "card", "aria-labelledby": "coverage-title" }, h("h2", { id: "coverage-title" }, "Coverage"), coverage),
       h("section", { class: "card", "aria-labelledby": "steps-title" }, h("h2", { id: "steps-title" }, "The whole job"), steps)));
 
@@ -95,7 +95,7 @@ function openGuide(app) {
 function mainButton(app, step) {
   if (step.is_busy) return h("button", { type: "button", class: "huge", disabled: true, "data-key": "main" }, "Please wait");
   if (!step.button) return null;
-  if (!app.may("operate")) return h("p", { class: "soft" }, `The operator now does this: ${step.button}.`);
+  if (!app.may("operate")) return h("p", { class: "soft" }, `The operator's next action: ${step.button}.`);
   const button = app.button(step.button, "operate", () => app.run("guide.done", { step: step.id }), "huge main");
   button.dataset.key = "main";
   return button;
@@ -105,12 +105,12 @@ function otherButtons(app, guide) {
   const { step } = guide;
   if (!app.may("operate")) return [];
   const skip = async (rest) => {
-    const reason = await app.confirm(rest ? "Skip all poses that are left?" : `Skip: ${step.title}?`,
-      ["The reason is kept with the guide."], "Skip", { kind: "danger", reason: WHY_SKIP });
+    const reason = await app.confirm(rest ? "Skip all remaining poses?" : `Skip: ${step.title}?`,
+      ["The reason is stored with the guide."], "Skip", { kind: "danger", reason: WHY_SKIP });
     if (reason) await app.run("guide.skip", { step: step.id, reason, ...(rest ? { rest: true } : {}) }, "Skipped");
   };
   const stop = async () => {
-    const reason = await app.confirm("Stop this guide?", ["What was measured is kept.", "The guide cannot be taken up again."],
+    const reason = await app.confirm("Stop this guide?", ["All measurements are kept.", "The guide cannot be resumed."],
       "Stop the guide", { kind: "danger", reason: WHY_STOP });
     if (reason) await app.run("guide.stop", { reason }, "The guide is stopped");
   };
@@ -119,7 +119,7 @@ function otherButtons(app, guide) {
   return [
     others.map((each) => app.button(each.button, "operate", () => app.run(each.command, each.arguments ?? {}))),
     step.can_skip ? app.button("Skip this step", "operate", () => skip(false)) : null,
-    step.can_skip && isPose ? app.button("Skip the poses that are left", "operate", () => skip(true)) : null,
+    step.can_skip && isPose ? app.button("Skip the remaining poses", "operate", () => skip(true)) : null,
     app.button("Stop the guide", "operate", stop, "danger"),
   ];
 }
@@ -127,12 +127,12 @@ function otherButtons(app, guide) {
 function holding(hold) {
   if (!hold) return null;
   const share = hold.needed_fixes ? hold.fixes / hold.needed_fixes : 0;
-  const text = hold.since_s === null ? "The boom moves." : `Standing for ${duration(hold.since_s)}; ${hold.fixes} of ${plural(hold.needed_fixes, "fix", "fixes")}.`;
+  const text = hold.since_s === null ? "The boom is moving." : `Standing for ${duration(hold.since_s)}; ${hold.fixes} of ${plural(hold.needed_fixes, "fix", "fixes")}.`;
   return [h("p", null, text), bar(text, 0, share)];
 }
 
 function move(joint) {
-  if (joint.now === null) return "not known";
+  if (joint.now === null) return "unknown";
   if (joint.difference === null) return `${measured(joint.now, joint.unit)}${unitName(joint.unit)}`;
   if (joint.is_there) return "there";
   const size = `${measured(Math.abs(joint.difference), joint.unit)}${unitName(joint.unit)}`;
@@ -160,7 +160,7 @@ function showJoints(list, rows, joints, app) {
 }
 
 function gainOf(accuracy) {
-  if (!accuracy) return h("p", { class: "empty" }, "After the first poses this shows how accurate the model will be.");
+  if (!accuracy) return h("p", { class: "empty" }, "After the first poses this shows the expected accuracy of the model.");
   const of = (label, value) => tile(label, millimetres(value), "mm");
   return [
     h("dl", { class: "tiles" }, of("Expected now", accuracy.now_mm), of("After the next pose", accuracy.after_next_mm), of("After 5 more", accuracy.after_5_mm),
@@ -179,7 +179,7 @@ function coverageOf(coverage, joints) {
     return h("li", null, h("span", null, label[joint.name]),
       bar(text, reached ? (joint.reached_low - joint.low) / range : 0, reached ? (joint.reached_high - joint.low) / range : 0), h("span", null, percent(joint.share)));
   };
-  return [h("p", null, `${percent(coverage.volume_share)} of the work volume lies within what was reached.`), h("ul", { class: "coverage" }, coverage.joints.map(line))];
+  return [h("p", null, `${percent(coverage.volume_share)} of the work volume lies within the joint ranges reached.`), h("ul", { class: "coverage" }, coverage.joints.map(line))];
 }
 
 const MARKS = { done: "\u2713", skipped: "\u2013", now: "\u25b6", "to do": "" };

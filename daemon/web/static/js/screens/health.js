@@ -20,7 +20,7 @@ export function mount(root, app) {
     part("jobs-title", "Jobs", jobs),
     h("div", { class: "pair" },
       part("channels-title", "Joints and signals", scroll("Readings of joints and signals", channels, ["channel", "state", "value", "age"])),
-      h("div", { class: "stack" }, part("gaps-title", "Gaps", gaps), part("events-title", "What happened", events))));
+      h("div", { class: "stack" }, part("gaps-title", "Gaps", gaps), part("events-title", "Events", events))));
 
   let all = [], seen = "", closed = false;
   async function readJobs() {
@@ -38,16 +38,16 @@ export function mount(root, app) {
       agedRows(channels, acquisition.channels, app);
       fill(gaps, acquisition.gaps.map((gap) => [gap.channel, gap.reason, Math.floor(gap.age_s)]), () => acquisition.gaps.length
         ? h("ul", null, acquisition.gaps.map((gap) => h("li", null, `${gap.channel}: ${words(gap.reason)} for ${duration(gap.age_s)}, since ${utc(gap.since_utc_ns)}`)))
-        : h("p", { class: "empty" }, "No gap is open: everything that should come comes."));
+        : h("p", { class: "empty" }, "No gap is open: all expected data arrive."));
       fill(events, now.events, () => now.events.length
         ? h("ul", { class: "small" }, now.events.map((event) => h("li", null, `${utc(event.utc_ns)} ${event.device}: ${event.text || words(event.kind)}`)))
-        : h("p", { class: "empty" }, "Nothing happened yet."));
+        : h("p", { class: "empty" }, "No events yet."));
       const key = JSON.stringify(now.jobs.map((job) => [job.id, job.state]));
       if (key !== seen && app.live.isLive) { seen = key; readJobs(); }
       const running = new Map(now.jobs.map((job) => [job.id, job]));
       const shown = all.toReversed().slice(0, JOBS_SHOWN).map((job) => ({ ...job, ...running.get(job.id) }));
       fill(jobs, [shown.map((job) => [job.id, job.state, Math.floor(100 * job.progress), job.message, job.error]), app.me.role], () => shown.length
-        ? shown.map((job) => jobCard(job, app)) : h("li", { class: "empty" }, "No jobs yet; those of a session are queued some seconds after it was closed."));
+        ? shown.map((job) => jobCard(job, app)) : h("li", { class: "empty" }, "No jobs yet; the jobs of a session are queued a few seconds after it is closed."));
     },
     close() { closed = true; },
   };

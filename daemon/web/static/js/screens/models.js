@@ -1,10 +1,10 @@
-// Models: the live one, what waits, before and after; accept, reject and roll back behind a confirmation with the reasons.
+// Models: the live and the waiting model, errors before and after; accept, reject and roll back after a confirmation with the reasons.
 
 import { command } from "../api.js";
 import { fill, h, s, table } from "../dom.js";
 import { millimetres, plural, sentence, utc, words } from "../words.js";
 
-const STAGES = { nominal: "drawings", geometric: "geometry", effects: "named effects", hybrid: "learned rest" };
+const STAGES = { nominal: "drawings", geometric: "geometry", effects: "named effects", hybrid: "learned residual" };
 
 export function mount(root, app) {
   const list = h("div", { class: "stack" });
@@ -46,7 +46,7 @@ function cards(models, jobs, now, app) {
     verdict.experiments.length ? h("ul", null, verdict.experiments.slice(0, 3).map((text) => h("li", null, `Next: ${text}`))) : null,
     h("div", { class: "row" }, h("a", { class: "button", href: `/report/${verdict.job}`, target: "_blank", rel: "noopener" }, "Open the gap report")));
   if (!models.length) {
-    return [h("section", { class: "card" }, h("h2", null, "No models yet"), h("p", null, "A guided session with a check ends with a first model."), h("a", { class: "button", href: "/guide" }, "Go to the guide")), gap];
+    return [h("section", { class: "card" }, h("h2", null, "No models yet"), h("p", null, "A guided session with a check produces a first model."), h("a", { class: "button", href: "/guide" }, "Go to the guide")), gap];
   }
   const waiting = now.models?.candidate?.id;
   const order = (model) => (model.id === waiting ? 0 : model.state === "live" ? 1 : 2);
@@ -59,7 +59,7 @@ function cards(models, jobs, now, app) {
 }
 
 function card(model, jobs, now, app) {
-  const state = { live: ["live", "tag good"], candidate: ["waits", "tag doubtful"], retired: ["retired", "tag"] }[model.state];
+  const state = { live: ["live", "tag good"], candidate: ["waiting", "tag doubtful"], retired: ["retired", "tag"] }[model.state];
   const compared = model.metrics.comparison;
   const candidate = now.models?.candidate?.id === model.id ? now.models.candidate : null;
   const report = jobs.findLast((job) => job.kind === "report" && job.state === "done" && job.result?.model === model.path);
@@ -77,7 +77,7 @@ function card(model, jobs, now, app) {
       model.state === "candidate" ? app.button("Compare again", "operate", () => app.run("model.compare", { id: model.id })) : null,
       report ? h("a", { class: "button", href: `/report/${report.id}`, target: "_blank", rel: "noopener" }, "Open its report") : null),
     !app.may("approve") && candidate?.is_acceptable ? h("p", { class: "soft" }, "Someone with the role approve can accept it.") : null,
-    h("details", null, h("summary", null, "Where it comes from"),
+    h("details", null, h("summary", null, "Origin"),
       h("p", null, `Made ${utc(model.created_utc_ns)} from ${model.sessions.join(", ") || "no session"}.`),
       table(`Changes of model ${model.id}`, [["when", true], ["state", true], ["by", true], ["why", true]], model.history.map((change) => [utc(change.utc_ns), change.state, change.operator || change.user || "rigcal", change.reason]))));
 }
@@ -95,19 +95,19 @@ async function accept(model, compared, now, app) {
 }
 
 async function reject(model, app) {
-  const reason = await app.confirm(`Reject model ${model.id}?`, ["It stays in the store and never goes live.", "The live model stays as it is."], "Reject", { kind: "danger", reason: ["Measured wrongly", "Not plausible", "Another one follows"] });
+  const reason = await app.confirm(`Reject model ${model.id}?`, ["It stays in the store and never goes live.", "The live model stays as it is."], "Reject", { kind: "danger", reason: ["Measured wrongly", "Not plausible", "A new model follows"] });
   if (reason) await app.run("model.reject", { id: model.id, reason }, `Model ${model.id} is rejected`);
 }
 
 async function rollBack(model, now, app) {
   const change = model.history.findLast((each) => each.state === "live" && each.replaced_id !== null);
   const before = change?.replaced_id;
-  if (before === undefined || before === null) { app.toast(`Model ${model.id} is the first that went live: there is none to put back.`, true); return; }
+  if (before === undefined || before === null) { app.toast(`Model ${model.id} is the first live model: there is no earlier model to put back.`, true); return; }
   const drift = now.gap?.drift;
   const reasons = [
     `Model ${before} takes the place of model ${model.id}.`,
     `Model ${model.id} went live ${utc(change.utc_ns)}: ${change.reason}.`,
-    drift?.ratio ? `The last check shots erred ${drift.ratio.toFixed(2)} times what model ${drift.model} expects.` : "No check shots were held against the live model yet.",
+    drift?.ratio ? `The error of the last check shots was ${drift.ratio.toFixed(2)} times what model ${drift.model} expects.` : "No check shots were compared with the live model yet.",
   ];
   if (await app.confirm(`Roll back to model ${before}?`, reasons, `Put model ${before} back`, { kind: "danger" }) !== null) {
     await app.run("model.rollback", {}, `Model ${before} is live again`);
@@ -119,7 +119,7 @@ async function putBack(model, now, app) {
   const left = model.history.findLast((change) => change.state === "retired");
   const reasons = [
     live ? `It takes the place of model ${live.id}, which is retired and can be put back too.` : "No model is live now.",
-    `Model ${model.id} left ${utc(left.utc_ns)}: ${left.reason}.`,
+    `Model ${model.id} was retired ${utc(left.utc_ns)}: ${left.reason}.`,
     model.metrics.comparison ? `When it was compared: ${model.metrics.comparison.sentence}.` : "It was never compared with held-out check shots.",
   ];
   if (await app.confirm(`Put model ${model.id} back?`, reasons, `Put model ${model.id} back`, { kind: "danger" }) !== null) {
@@ -138,7 +138,7 @@ function errors(model) {
   const values = [...rows.map((row) => row[1]), ...held, noise].filter((value) => value > 0);
   const low = Math.floor(Math.log10(Math.min(...values)) * 2) / 2, high = Math.ceil(Math.log10(Math.max(...values)) * 2 + 0.01) / 2;
   const lines = [...rows.map(([name, value]) => [name, [value]]), ...(held.length ? [["held-out checks", held]] : [])];
-  // As wide as the screen lets it be, so that its letters are as large as others; on a phone names stand above their lines.
+  // As wide as the screen allows, so that its text has the usual size; on a phone, names stand above their lines.
   const width = Math.min(Math.max(innerWidth - 90, 260), 760), isNarrow = width < 560;
   const left = isNarrow ? 24 : 150, right = width - 140, step = isNarrow ? 48 : 30, bottom = 24 + step * lines.length;
   const x = (value) => left + ((right - left) * (Math.log10(value) - low)) / (high - low || 1);

@@ -1,4 +1,4 @@
-// Now: one state, one next step, the figures that matter, and what is wrong.
+// Now: the state, the next step, the main figures, and the alarms.
 
 import { fill, h, say, tile } from "../dom.js";
 import { alarmList } from "../alarms.js";
@@ -29,11 +29,11 @@ export function mount(root, app) {
 
 const minute = (now) => now.alarms.active.map((alarm) => Math.floor(alarm.age_s / 60));
 
-/** The one large button: what the daemon says is next. */
+/** The one large button: the next step according to the daemon. */
 export function button(app, next) {
   if (!next.button) return null;
   if (next.screen) return h("button", { type: "button", class: "huge main", "data-key": "next", onclick: () => app.go(next.screen) }, next.button);
-  if (!app.may("operate")) return h("p", { class: "soft" }, `The operator now does this: ${next.button}.`);
+  if (!app.may("operate")) return h("p", { class: "soft" }, `The operator's next action: ${next.button}.`);
   return app.button(next.button, "operate", () => app.run(next.command, next.arguments), "huge main");
 }
 
@@ -51,7 +51,7 @@ function figuresOf({ guide, session, models, control_shots: shots, gap }) {
   if (!open && !session) {
     found.push(["Live model", models?.live ? String(models.live.id) : "none", "", models?.live?.stage ?? ""]);
     const drift = gap?.drift;
-    if (drift?.checks) found.push(["Last check", fixed(drift.ratio, 2), "", "error by what is expected; 1 is as predicted"]);
+    if (drift?.checks) found.push(["Last check", fixed(drift.ratio, 2), "", "error divided by the expected error; 1 is as predicted"]);
   }
   return found;
 }

@@ -1,4 +1,4 @@
-// Session: fixes and residuals as they come, what was excluded and why, control points, jobs.
+// Session: fixes and residuals as they arrive, exclusions with their reasons, control points, jobs.
 
 import { command, get } from "../api.js";
 import { Chart } from "../chart.js";
@@ -57,7 +57,7 @@ export function mount(root, app) {
     const size = (fix) => (fix.residual_mm ? Math.hypot(...fix.residual_mm) : null);
     const spread = spreads(fixes.fixes);
     const isModel = fixes.fixes.some((fix) => fix.residual_mm);
-    say(note, !fixes.fixes.length ? (session.state === "open" ? "No fix has come yet." : "No fix came in this session.") : [fixes.note, isModel ? `Measured less what model ${fixes.model} predicts.` : "Shown is how far each fix lies from the mean of its pose."].filter(Boolean).join(" "));
+    say(note, !fixes.fixes.length ? (session.state === "open" ? "No fix has arrived yet." : "This session has no fixes.") : [fixes.note, isModel ? `Measured minus predicted by model ${fixes.model}.` : "The chart shows the distance of each fix from the mean of its pose."].filter(Boolean).join(" "));
     const value = (fix) => (isModel ? size(fix) : spread.get(fix.id) ?? null);
     chart.box.setAttribute("aria-label", isModel ? "Distance of each fix from the live model's prediction over time" : "Distance of each fix from the mean of its pose over time");
     chart.show([fixes.fixes.map((fix) => fix.utc_ns / 1e9),
@@ -79,7 +79,7 @@ export function mount(root, app) {
   };
 }
 
-/** Distance of each used fix from the mean of its pose, mm: what shows before any model predicts. */
+/** Distance of each used fix from the mean of its pose, mm; shown as long as no model predicts. */
 function spreads(fixes) {
   const byPose = Map.groupBy(fixes.filter((fix) => fix.excluded === null && fix.pose !== null), (fix) => fix.pose);
   const found = new Map();
@@ -101,15 +101,15 @@ function poseTable(fixes, spread, size) {
   return table("The newest poses first", [["at", true], ["fixes used", false], ["spread, mm", false], ["residual, mm", false], ["excluded because", true]], rows);
 }
 
-/** What an operator does in a session that no guide leads. */
+/** Buttons for a session without a guide. */
 function byHand(session, app) {
   const points = [...new Set(session.control_shots.map((shot) => shot.point))];
   const stop = async () => {
-    const go = await app.confirm(`End session ${session.id}?`, ["Its jobs follow by themselves.", "Shoot the control points before: without them the session is not used."], "End the session");
+    const go = await app.confirm(`End session ${session.id}?`, ["Its jobs then start automatically.", "Shoot the control points first: without them the session is not used."], "End the session");
     if (go !== null) await app.run("session.stop", {}, "The session is ended");
   };
   const abort = async () => {
-    const go = await app.confirm(`Abort session ${session.id}?`, ["It is kept and never calibrated with."], "Abort the session", { kind: "danger" });
+    const go = await app.confirm(`Abort session ${session.id}?`, ["It is kept, but never used for calibration."], "Abort the session", { kind: "danger" });
     if (go !== null) await app.run("session.abort", {}, "The session is aborted");
   };
   return [
@@ -118,7 +118,7 @@ function byHand(session, app) {
   ];
 }
 
-/** The session in short; `led` is the guide that leads it, null without one. */
+/** Summary of the session; `led` is the guide that leads it, null without one. */
 function summary(session, led, app) {
   const state = session.state === "open" ? ["open", "tag good"] : session.not_used ? ["not used", "tag bad"] : [session.state, "tag"];
   const shots = session.control_shots.map((shot) => `${shot.point} at the ${shot.phase}: ${shot.misclosure_mm === null ? "defined" : `${fixed(shot.misclosure_mm, 1)} mm off`}`);
