@@ -1,5 +1,5 @@
-"""The mathematics: arrays in, arrays out. No I/O, no clock, no threads that it does not own.
+"""The mathematics of calibration: arrays in, arrays out; no I/O, no clock, no threads other than its own.
 
 Inside this package lengths are mm and angles rad; readings keep the unit of their column (deg or mm) until
-`kinematics` turns them into chain values.
+`kinematics` converts them to chain values.
 """

@@ -6,11 +6,11 @@ MESSAGE_MAX = 1000  # characters
 
 
 class CalibrationError(Exception):
-    """Base of all errors of `calibration`; on its own, it says that the computation failed."""
+    """Base class of all errors of `calibration`; raised itself when a computation fails."""
 
     def __str__(self) -> str:
         text = super().__str__()
-        # What was found is quoted, and may be anything
+        # Messages quote the input, which may be arbitrarily long
         return text if len(text) <= MESSAGE_MAX else f"{text[:MESSAGE_MAX]}..."
 
 
@@ -19,9 +19,9 @@ class RigError(CalibrationError):
 
     Args:
         source: name of the file.
-        where: key in it; empty for the whole file.
+        where: key in the file; empty for the whole file.
         reason: the fault, and what is allowed.
-        line: number of the line, from 1, where it is known.
+        line: number of the line, from 1; None if unknown.
     """
 
     def __init__(self, source: str, where: str, reason: str, line: int | None = None) -> None:
@@ -35,9 +35,9 @@ class DataError(CalibrationError):
 
     Args:
         source: name of the file or table.
-        reason: the fault, and how to mend it.
-        line: number of the line, from 1.
-        column: name of the column.
+        reason: the fault, and how to correct it.
+        line: number of the line, from 1; None if the fault is not in one line.
+        column: name of the column; None if the fault is not in one column.
     """
 
     def __init__(self, source: str, reason: str, line: int | None = None, column: str | None = None) -> None:
@@ -47,8 +47,8 @@ class DataError(CalibrationError):
 
 
 class ModelError(CalibrationError):
-    """A model directory is truncated, edited, of another version, or not a model at all."""
+    """A model directory is truncated, edited, of an unsupported version, or not a model at all."""
 
 
 class UnsafeError(CalibrationError):
-    """The result would be unsafe to use: not identifiable, worse than the live model, another rig's data."""
+    """The result would be unsafe to use: not identifiable, worse than the live model, or from another rig's data."""

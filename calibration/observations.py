@@ -1,4 +1,4 @@
-"""Observations: fixes with the joint readings at their own instants, the one table that all methods take."""
+"""Observations: fixes with the joint readings at the same instants, the input table of all methods."""
 
 from __future__ import annotations
 
@@ -32,16 +32,16 @@ from calibration.table import (
 Floats = NDArray[np.float64]
 Strings = NDArray[np.str_]
 
-ROW = "row"  # an optional column that no file has: the number of the row, from 0, where no time is known
+ROW = "row"  # an optional column that is never in a file: the row's number, from 0, added where no time is known
 DIRECTIONS = (-1.0, 0.0, 1.0)
-DIGEST = 10  # hexadecimal digits by which a row is known again: of 6,000 rows in 6,000 others one in 30,000 by chance
+DIGEST = 10  # hexadecimal digits of a row's digest; any false match between two tables of 6,000 rows: 1 in 30,000
 CELL_MM = 100.0
-_CELL_SHARE = 0.4  # of the spread of all places: no cell is larger
+_CELL_SHARE = 0.4  # of the spread of all positions: the largest width of a cell
 _MOST_DEG = 36_000.0  # a hundred turns
-_MOST_TURNS_DEG = 720.0  # more than the limits have, within one file
+_MOST_TURNS_DEG = 720.0  # readings of one file may span this much more than the joint's limits
 _MOST_MM = 1e7  # 10 km
-# Possible values of an optional column, by the end of its name (the first that fits); anything beyond is in another
-# unit, or noise that would drown every number it meets.
+# Possible values of an optional column, by the end of its name (the first match counts). Values outside are in a
+# different unit, or are garbage that would swamp the computation.
 _POSSIBLE = {
     "dwell_s": (0.0, 1e9),
     "payload_kg": (0.0, 1e5),
@@ -60,19 +60,20 @@ class Observations:
 
     Attributes:
         prism: (n,) prism of each fix.
-        joints: joint name -> (n,) readings, deg or mm as the rig's joint says; from a file, angles are on the turn of
+        joints: joint name -> (n,) readings in the unit of the joint, deg or mm; from a file, angles are on the turn of
             the joint's limits (`limits.on_one_turn`).
-        position_mm: (n, 3) in the station's frame; NaN rows only where positions were not required.
-        sigma_mm: (n, 3) standard deviation of each coordinate; NaN where not given.
-        setup: (n,) station set-up; "" where not given.
-        session: (n,) calibration session; "" where not given.
-        pose: (n,) standstill; "" where not given. A pose is unique within its session and set-up.
+        position_mm: (n, 3) in the station's frame; rows can be NaN only if positions were not required.
+        sigma_mm: (n, 3) standard deviation of each coordinate; NaN if not given.
+        setup: (n,) station set-up; "" if not given.
+        session: (n,) calibration session; "" if not given.
+        pose: (n,) standstill; "" if not given. A pose is unique within its session and set-up.
         extra: optional columns by their CSV name (`time_s`, `theta1_dir`, `boom_valve_mA`, ...) -> (n,), NaN where
             not measured.
         ignored_columns: columns of the file that docs/reference/rig-keys.md does not name.
-        ignored_numbers: those of them that hold numbers, which a signal of the rig file could use.
-        row_numbers: (n,) where each row was read (`row_name`); None for rows that were made in a program.
-        place: what numbers them: the lines of a file, its header is line 1, or the rows of a data frame, from 0.
+        ignored_numbers: the ignored columns that hold numbers, which a signal of the rig file could use.
+        row_numbers: (n,) number of the line or row that each row was read from (`row_name`); None for rows that were
+            made in a program.
+        place: what `row_numbers` count: lines of a file, whose header is line 1, or rows of a data frame, from 0.
     """
 
     prism: Strings
@@ -90,7 +91,7 @@ class Observations:
 
     @classmethod
     def from_csv(cls, path_or_text: str | Path, rig: Rig, *, positions_required: bool = True) -> Observations:
-        """Read observations from a CSV file or its text; a bad file is refused whole.
+        """Read observations from a CSV file or its text; one bad cell rejects the whole file.
 
         Columns: `prism`; every joint as `<joint>_deg` or `<joint>_mm`; `x_mm`, `y_mm`, `z_mm` of the fix in the
         station's frame; optionally `setup`, `session`, `pose`, `sigma_x_mm` and so on, `time_s`, signals.
@@ -101,7 +102,7 @@ class Observations:
             positions_required: False for prediction, where positions may be missing or empty.
 
         Raises:
-            DataError: with file, line, column and reason.
+            DataError: the file is malformed or does not fit the rig; names file, line, column and reason.
         """
         if isinstance(path_or_text, str) and "\n" in path_or_text:
             return parse_observations(path_or_text.encode(), rig, "text", positions_required=positions_required)
@@ -114,15 +115,15 @@ class Observations:
 
     @classmethod
     def from_frame(cls, frame: DataFrame, rig: Rig, *, positions_required: bool = True) -> Observations:
-        """Take observations from a data frame of pandas or polars, or anything with such columns.
+        """Read observations from a data frame of pandas or polars, or any object with such columns.
 
         Args:
-            frame: the columns of `from_csv`; None and NaN stand for what was not measured.
+            frame: the columns of `from_csv`; None and NaN mean "not measured".
             rig: the machine that was measured.
             positions_required: False for prediction, where positions may be missing or NaN.
 
         Raises:
-            DataError: with row (from 0), column and reason.
+            DataError: the frame is malformed or does not fit the rig; names row (from 0), column and reason.
         """
         return _build(
             read_frame(frame, rig, "data frame", positions_required=positions_required), rig, positions_required
@@ -147,24 +148,24 @@ class Observations:
         )
 
     def numbered(self) -> Observations:
-        """Return the observations with the number of each row as a further column, where they have no time."""
+        """Return the observations, with the row numbers as a further column `ROW` if no row has a time."""
         if ROW in self.extra or np.isfinite(self.extra.get("time_s", np.full(1, np.nan))).any():
             return self
         return replace(self, extra={**self.extra, ROW: np.arange(len(self), dtype=np.float64)})
 
     def row_number(self, row: int) -> int:
-        """Return the number of a row, from 0, where it was read."""
+        """Return the number of the line or row that row `row` (from 0) was read from."""
         return row if self.row_numbers is None else int(self.row_numbers[row])
 
     def row_name(self, *rows: int) -> str:
-        """Return what a sentence calls rows, from 0: `line 17`, `lines 17, 43`, `row 16 (from 0)` of a data frame."""
+        """Return the name of rows, given from 0, for messages: `line 17`, `lines 17, 43`, `row 16 (from 0)`."""
         numbers = ", ".join(str(self.row_number(row)) for row in rows)
         return f"{self.place}{'s' if len(rows) > 1 else ''} {numbers}{' (from 0)' if self.place == 'row' else ''}"
 
     def groups(self) -> Strings:
-        """Return (n,) labels for grouped splits: sessions or set-ups where there are several, else workspace cells.
+        """Return (n,) labels for grouped splits: sessions if there are several, else set-ups, else workspace cells.
 
-        Cells are 100 mm wide, or less where the machine is small (`cell_mm`).
+        Cells are 100 mm wide, or less for a small machine (`cell_mm`).
         """
         for labels in (self.session, self.setup):
             if len(np.unique(labels)) > 1:
@@ -172,25 +173,25 @@ class Observations:
         return self.cells(cell_mm(self.position_mm, self.setup))
 
     def cells(self, size_mm: float = CELL_MM) -> Strings:
-        """Return (n,) workspace cells: coordinates divided by `size_mm` and rounded to even halves, as `round` does."""
+        """Return (n,) workspace cells: coordinates divided by `size_mm` and rounded, halves to even."""
         index = np.rint(self.position_mm / size_mm).astype(int)
         return np.array([f"{x},{y},{z}" for x, y, z in index], dtype=np.str_)
 
 
 def cell_mm(position_mm: Floats, setup: Strings | NDArray[np.intp]) -> float:
-    """Return the width of the workspace cells that split a machine's fixes: 100 mm, or less where it is small.
+    """Return the width of the workspace cells that split a machine's fixes: 100 mm, or less for a small machine.
 
-    Otherwise all fixes of a small machine would be in one cell, and nothing would be left to split.
+    With cells of 100 mm, all fixes of a small machine could be in one cell and could not be split.
 
     Args:
-        position_mm: as for `spread_mm`.
-        setup: as for `spread_mm`.
+        position_mm: (n, 3) mm.
+        setup: (n,) labels.
     """
     return min(CELL_MM, _CELL_SHARE * spread_mm(position_mm, setup)) or CELL_MM
 
 
 def spread_mm(position_mm: Floats, setup: Strings | NDArray[np.intp]) -> float:
-    """Return the median distance of positions from the median place of their set-up; 0 where there are none.
+    """Return the median distance, mm, of positions from the median position of their set-up; 0 without positions.
 
     Args:
         position_mm: (n, 3) mm.
@@ -203,22 +204,22 @@ def spread_mm(position_mm: Floats, setup: Strings | NDArray[np.intp]) -> float:
 
 
 def parse_observations(data: bytes, rig: Rig, source: str, *, positions_required: bool = True) -> Observations:
-    """Read an observations CSV; a bad file is refused whole.
+    """Read an observations CSV; one bad cell rejects the whole file.
 
     Args:
         data: the file's bytes (UTF-8, comma, header; a byte-order mark is tolerated).
-        rig: whose joints and prisms the file must have.
+        rig: the machine that was measured; the file must have its joints and prisms.
         source: file name for messages.
         positions_required: False for prediction, where `x_mm,y_mm,z_mm` may be missing or empty.
 
     Raises:
-        DataError: with file, line, column and reason.
+        DataError: the file is malformed or does not fit the rig; names file, line, column and reason.
     """
     return _build(read_csv(data, rig, source, positions_required=positions_required), rig, positions_required)
 
 
 def format_observations(observations: Observations, rig: Rig) -> str:
-    """Write observations as CSV, with shortest exact numbers and empty cells where nothing was measured.
+    """Format observations as CSV: shortest exact numbers, and empty cells where nothing was measured.
 
     Args:
         observations: the table.
@@ -247,10 +248,10 @@ def data_sha256(observations: Observations, rig: Rig) -> str:
 
 
 def row_digests(observations: Observations) -> list[str]:
-    """Return `DIGEST` hexadecimal digits for each row, the same for rows of one prism with the same fix.
+    """Return a digest of each row, `DIGEST` hexadecimal digits that recognise the same fix in a different file.
 
-    Readings count to nine digits and positions to a micrometre, whatever else a file says of the row, so that a fix is
-    known again in another file.
+    The digest depends on the prism, the readings rounded to nine digits and the position rounded to a micrometre; other
+    columns do not matter.
     """
     columns = [observations.prism.tolist()]
     columns += [[f"{value:.9g}" for value in readings.tolist()] for readings in observations.joints.values()]
@@ -260,12 +261,15 @@ def row_digests(observations: Observations) -> list[str]:
 
 
 def are_among(observations: Observations, digests: Collection[str]) -> NDArray[np.bool_]:
-    """(n,) True for rows whose digest is one of some."""
+    """Return an (n,) mask, True for rows whose digest (`row_digests`) is in `digests`."""
     return np.isin(row_digests(observations), list(digests))
 
 
 def originals(observations: Observations) -> NDArray[np.intp]:
-    """Return (n,) the first row with the same readings and position in every digit; later ones are only copies."""
+    """Return (n,) the index of the first row with exactly the same prism, set-up, readings and position.
+
+    Rows whose index differs from their own are copies.
+    """
     numbers = np.column_stack([*observations.joints.values(), observations.position_mm]).tolist()
     labels = zip(observations.prism.tolist(), observations.setup.tolist(), strict=True)
     seen: dict[tuple[object, ...], int] = {}
@@ -276,7 +280,7 @@ def originals(observations: Observations) -> NDArray[np.intp]:
 
 
 def is_original(observations: Observations) -> NDArray[np.bool_]:
-    """(n,) False for copies of an earlier row, which are no further measurement."""
+    """Return an (n,) mask, False for copies of an earlier row, which are not independent measurements."""
     return np.asarray(originals(observations) == np.arange(len(observations)))
 
 
@@ -285,7 +289,7 @@ def _cells(values: Floats | Strings) -> list[str]:
 
 
 def _build(table: Table, rig: Rig, positions_required: bool) -> Observations:
-    """Take the columns of a table, and refuse values that no measurement can have."""
+    """Build observations from the columns of a table; raise DataError for values that no measurement can have."""
     prism = table.labels("prism")
     for row, name in enumerate(prism.tolist()):
         if name not in rig.prism_names:
@@ -296,31 +300,35 @@ def _build(table: Table, rig: Rig, positions_required: bool) -> Observations:
     for i, name in enumerate(SIGMA_COLUMNS):
         partly = ~given[:, i] & given.any(axis=1)
         if partly.any():
-            reason = "empty beside the row's other sigmas; a fix has all three or none"
+            reason = "empty, but the row has other sigmas; give all three or none"
             table.refuse(int(np.argmax(partly)), name, reason)
         own = sigma_mm[:, i]
         table.refuse_where(own <= 0, name, own, "is not a standard deviation; it must be positive")
-        reason = f"is smaller than any instrument's standard deviation ({LEAST_SIGMA_MM:g} mm); is it in another unit?"
+        reason = f"is smaller than any instrument's standard deviation (at least {LEAST_SIGMA_MM:g} mm); check the unit"
         table.refuse_where(own < LEAST_SIGMA_MM, name, own, reason)
     joints = {j.name: table.numbers(j.column, required=True) for j in rig.joints}
     for joint in rig.joints:
         limit = _MOST_DEG if joint.kind == "revolute" else _MOST_MM
         values = joints[joint.name]
-        reason = f"is beyond what a joint can read ({limit:g} {joint.unit})"
+        reason = f"is beyond what a joint can read (at most {limit:g} {joint.unit}); check the unit"
         table.refuse_where(np.abs(values) > limit, joint.column, values, reason)
         low, high = float(values.min()), float(values.max())
         if joint.kind == "revolute" and high - low > joint.limits[1] - joint.limits[0] + _MOST_TURNS_DEG:
             table.refuse_column(
                 joint.column,
-                f"readings from {low:.6g} to {high:.6g} deg, turns further than its limits {joint.limits[0]:g} .. "
-                f"{joint.limits[1]:g} deg allow; were they converted to degrees twice?",
+                f"readings from {low:.6g} to {high:.6g} deg span more turns than the joint's limits, "
+                f"{joint.limits[0]:g} .. {joint.limits[1]:g} deg, allow; were they converted to degrees twice?",
             )
     position_mm = table.triple(POSITION_COLUMNS, required=positions_required)
     for name, values in zip(POSITION_COLUMNS, position_mm.T, strict=True):
-        reason = f"is beyond a station's reach ({_MOST_MM:g} mm); of map coordinates, subtract the instrument's"
+        reason = (
+            f"is beyond the range of a total station (at most {_MOST_MM:g} mm); subtract the instrument's coordinates "
+            f"from map coordinates"
+        )
         table.refuse_where(np.abs(values) > _MOST_MM, name, values, reason)
     for name, values in zip(SIGMA_COLUMNS, sigma_mm.T, strict=True):
-        table.refuse_where(values > _MOST_MM, name, values, f"is no standard deviation of a fix ({_MOST_MM:g} mm)")
+        reason = f"is too large for the standard deviation of a fix (at most {_MOST_MM:g} mm); check the unit"
+        table.refuse_where(values > _MOST_MM, name, values, reason)
     extra_names = extra_columns(table.header, rig)
     extra = {name: table.numbers(name, required=False) for name in extra_names}
     directions = {f"{name}_dir" for name in rig.joint_names}
@@ -329,7 +337,7 @@ def _build(table: Table, rig: Rig, positions_required: bool) -> Observations:
             bad = np.isfinite(values) & ~np.isin(values, DIRECTIONS)
             table.refuse_where(bad, name, values, "is not a direction; allowed: -1, 0, 1")
         low, high = next(ends for ending, ends in _POSSIBLE.items() if name.endswith(ending))
-        reason = f"is beyond what it can be ({low:g} .. {high:g}); is it in another unit?"
+        reason = f"is outside the possible range ({low:g} .. {high:g}); check the unit"
         table.refuse_where((values < low) | (values > high), name, values, reason)
     return Observations(
         prism=prism,

@@ -1,4 +1,4 @@
-"""Settings of a run that are no part of its data: seed, workers, progress, stop and checkpoint."""
+"""Settings of a run that are not part of its data: seed, workers, progress, stop and checkpoint."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from typing import Protocol
 from calibration.numerics.single_thread import SingleThreaded, one_blas_thread
 
 Progress = Callable[[float, str], None]
-"""Told the share of the work that is done, 0 to 1, and what is going on."""
+"""Callback that receives the share of the work done, 0 to 1, and a message about the current step."""
 
 _MOST_WORKERS = 4
 
 
 class Checkpoint(Protocol):
-    """A place where a search saves its state; the caller owns the file."""
+    """Storage in which a search saves its state; the caller owns the file."""
 
     def load(self) -> bytes | None:
-        """Return what was saved last; None where there is nothing."""
+        """Return the state that was saved last, or None."""
 
     def save(self, state: bytes) -> None:
-        """Replace the saved state, whole or not at all.
+        """Replace the saved state atomically.
 
         Raises:
             OSError: the state cannot be saved.
@@ -32,11 +32,11 @@ class Checkpoint(Protocol):
 
 
 def _silent(share: float, message: str) -> None:
-    """Report to nobody."""
+    """Discard a progress report."""
 
 
 def _never() -> bool:
-    """Let the run go on to its end."""
+    """Never stop the run early."""
     return False
 
 
@@ -44,14 +44,14 @@ def _never() -> bool:
 class Run:
     """Seed, workers, progress, stop and checkpoint of a computation.
 
-    The result depends on the seed alone: not on the executor, and not on an interruption that a checkpoint bridges.
+    The result depends on the seed only: neither on the executor nor on an interruption that a checkpoint resumes.
 
     Attributes:
-        seed: of everything random.
-        executor: runs what is independent; threads of the run's own by default.
-        progress: told the share done, 0 to 1, and what is going on; an exception that it raises ends the run.
-        should_stop: asked during a global search; once it returns True, the best candidate so far is taken.
-        checkpoint: where a global search saves its state, and from where it goes on.
+        seed: seed of all random numbers.
+        executor: runs independent tasks; by default the run makes a thread pool of its own.
+        progress: called with the share done, 0 to 1, and a message; an exception that it raises ends the run.
+        should_stop: called during a global search; once it returns True, the search returns its best candidate so far.
+        checkpoint: where a global search saves its state and resumes from.
     """
 
     seed: int = 0
@@ -61,12 +61,12 @@ class Run:
     checkpoint: Checkpoint | None = None
 
     def part(self, begin: float, end: float, message: str = "{}") -> Run:
-        """Return this run for a part of the work.
+        """Return this run with its progress scaled to a part of the work.
 
         Args:
-            begin: share of the whole that is done when the part begins.
-            end: share that is done when it ends.
-            message: reported by the part; `{}` stands for its own message.
+            begin: share of the whole work that is done when the part begins.
+            end: share of the whole work that is done when the part ends.
+            message: message that is reported for the part; `{}` stands for the part's own message.
         """
         progress = self.progress
         return replace(
@@ -75,18 +75,18 @@ class Run:
         )
 
     def quiet(self, seed: int | None = None) -> Run:
-        """Return a run with the same workers that goes on to its end and neither reports nor saves.
+        """Return a run with the same workers that reports no progress, saves no state and never stops early.
 
         Args:
-            seed: this run's by default.
+            seed: seed of the returned run; this run's seed by default.
         """
         return Run(self.seed if seed is None else seed, self.executor)
 
     @contextmanager
     def workers(self) -> Iterator[Executor]:
-        """Yield the executor, or threads for as long as the context lasts.
+        """Yield the executor, or a thread pool that lives as long as the context.
 
-        Meanwhile each call into BLAS keeps to one thread, here and in the workers.
+        Within the context each BLAS call uses one thread, in the caller and in the workers.
         """
         with one_blas_thread():
             if isinstance(self.executor, SingleThreaded):
@@ -99,4 +99,4 @@ class Run:
 
 
 DEFAULT_RUN = Run()
-"""Seed 0, threads of its own, to the end, and no reports."""
+"""Seed 0, a thread pool of its own, no progress reports, no early stop and no checkpoint."""

@@ -1,4 +1,4 @@
-"""Columns of observations that someone else wrote, as a CSV file or a data frame: read, and checked cell by cell."""
+"""Reading of observation tables, CSV files or data frames from any source, with a check of every cell."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ Floats = NDArray[np.float64]
 Strings = NDArray[np.str_]
 
 Place = Literal["line", "row"]
-"""What numbers the rows: the lines of a file, the first is 1, or the rows of a data frame, the first is 0."""
+"""How messages number rows: by the line of the file, from 1, or by the row of the data frame, from 0."""
 
 POSITION_COLUMNS = names(POSITION)
 SIGMA_COLUMNS = names(SIGMA)
 LABEL_COLUMNS = names(LABELS)
 
-_LONGEST = 200  # characters of a label or a number; every row's label takes as much memory as the longest
+_LONGEST = 200  # characters of a label or a number; the label of every row takes as much memory as the longest one
 _LONGEST_ROW = 1 << 20
 _MOST_COLUMNS = 1000
-_MOST_COLUMNS_NAMED = 8  # by a message, each by as many of its characters as the next line says
-_LONGEST_NAME_TOLD = 40
+_MOST_COLUMNS_NAMED = 8  # in a message
+_LONGEST_NAME_TOLD = 40  # characters of a column's name in a message
 _MOST_LABEL_BYTES = 64 << 20
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 _NO_NUMBERS = {"nan", "na", "n/a", "null", "none", "inf", "-inf", "+inf", "infinity", "-"}
@@ -41,7 +41,7 @@ _NOT_MEASURED = {"nan", "None", "<NA>", "NaT"}  # cells of data frames, as text
 
 
 class DataFrame(Protocol):
-    """A table with named columns, as pandas and polars have it."""
+    """A table with named columns, such as a data frame of pandas or polars."""
 
     @property
     def columns(self) -> Iterable[Any]:
@@ -52,18 +52,18 @@ class DataFrame(Protocol):
 
 
 class Table:
-    """The wanted columns of a table, row by row; numbers take eight bytes each, whatever was written.
+    """The columns of a table that rigcal uses, filled row by row; each number takes eight bytes.
 
     Args:
         source: name of the table for messages.
         header: names of its columns.
-        rig: whose joints, prisms, channels and signals are wanted.
-        positions_required: False where the columns of positions may be missing.
-        place: what numbers the rows.
+        rig: the rig whose joints, prisms, channels and signals determine the columns to read.
+        positions_required: False if the position columns may be missing.
+        place: how messages number rows.
 
     Attributes:
         header: names of its columns.
-        place: what numbers the rows.
+        place: how messages number rows.
 
     Raises:
         DataError: a column is missing, appears twice or has no name.
@@ -95,33 +95,37 @@ class Table:
 
     @property
     def wanted(self) -> set[str]:
-        """Names of the columns that are read; all others are passed over."""
+        """Names of the columns that are read; all others are ignored."""
         return {*self._numbers, *self._labels}
 
     @property
     def ignored(self) -> tuple[str, ...]:
-        """Names of the columns that are passed over."""
+        """Names of the columns that are ignored."""
         return tuple(self._ignored)
 
     @property
     def ignored_numbers(self) -> tuple[str, ...]:
-        """Names of those that hold numbers, not all the same, and that rigcal has not written itself."""
+        """Names of the ignored columns that hold numbers, not all equal, and that rigcal did not write itself."""
         own = names(WRITTEN)
         return tuple(name for name, column in self._ignored.items() if column.varies and name not in own)
 
     @property
     def row_numbers(self) -> NDArray[np.intp]:
-        """(n,) number of each row, as messages name it."""
+        """(n,) number of each row, as in messages."""
         return np.array(self._lines, dtype=np.intp)
 
     def append(self, row: Sequence[str], line: int) -> None:
-        """Take a row.
+        """Append a row.
+
+        Args:
+            row: its cells, in the order of the header.
+            line: its number, as in messages.
 
         Raises:
-            DataError: it has another number of fields than the header.
+            DataError: the row has more or fewer fields than the header.
         """
         if len(row) != len(self.header):
-            raise DataError(self._source, f"{len(row)} fields where the header has {len(self.header)}", line)
+            raise DataError(self._source, f"{len(row)} fields, but the header has {len(self.header)}", line)
         self._lines.append(line)
         for place, column in self._number_places:
             column.append(row[place].strip(), line)
@@ -135,7 +139,7 @@ class Table:
         """Return a column (n,) of numbers, NaN where a cell is empty.
 
         Raises:
-            DataError: a cell is no number, or is empty where every row needs it.
+            DataError: a cell is not a finite number, or is empty although `required`.
         """
         found = self._numbers[column]
         first = found.empty_line if required else None
@@ -147,7 +151,7 @@ class Table:
         return np.frombuffer(found.values)
 
     def triple(self, columns: tuple[str, ...], *, required: bool) -> Floats:
-        """Return three columns (n, 3) of numbers; NaN for those that the table lacks."""
+        """Return three columns (n, 3) of numbers; a column that the table lacks is NaN."""
         out = np.full((len(self), 3), np.nan)
         for i, name in enumerate(columns):
             if name in self.header:
@@ -155,10 +159,10 @@ class Table:
         return out
 
     def labels(self, column: str) -> Strings:
-        """Return a column (n,) of labels, "" where there is no such column.
+        """Return a column (n,) of labels, all "" if the table has no such column.
 
         Raises:
-            DataError: a label is too long, or two labels only look the same.
+            DataError: a label is too long, or two different labels look the same.
         """
         cells = self._labels.get(column, [""] * len(self))
         alike: dict[str, str] = {}
@@ -166,21 +170,23 @@ class Table:
         for cell in dict.fromkeys(cells):
             longest = max(longest, len(cell))
             if len(cell) > _LONGEST:
-                self.refuse(cells.index(cell), column, f"a label of {len(cell)} characters; at most {_LONGEST}")
+                reason = f"the label has {len(cell)} characters; the maximum is {_LONGEST}"
+                self.refuse(cells.index(cell), column, reason)
             if 4 * longest * len(cells) > _MOST_LABEL_BYTES:
-                reason = f"a label of {len(cell)} characters among {len(cells)} rows; shorten it"
+                reason = f"the label has {len(cell)} characters, too many in a table of {len(cells)} rows; shorten it"
                 self.refuse(cells.index(cell), column, reason)
             other = alike.setdefault(_plain(cell), cell)
             if other != cell:
-                self.refuse(cells.index(cell), column, f"{cell!a} and {other!a} look the same; write them alike")
+                reason = f"{cell!a} and {other!a} look the same but differ; write them with the same characters"
+                self.refuse(cells.index(cell), column, reason)
         return np.array(cells, dtype=np.str_)
 
     def refuse(self, row: int, column: str, reason: str) -> NoReturn:
-        """Raise DataError for a row, counted from 0."""
+        """Raise DataError for a cell of row `row`, counted from 0."""
         self._refuse_line(self._lines[row], column, reason)
 
     def refuse_where(self, bad: NDArray[np.bool_], column: str, values: Floats, reason: str) -> None:
-        """Raise DataError for the first of the `bad` (n,) rows, if any, with its value."""
+        """Raise DataError for the first row of the (n,) mask `bad`, if any; the message begins with its value."""
         if bad.any():
             row = int(np.argmax(bad))
             self.refuse(row, column, f"{values[row]:g} {reason}")
@@ -200,29 +206,30 @@ class Table:
     def _check_header(self, rig: Rig, positions_required: bool) -> None:
         header = self.header
         if not header or header == [""]:
-            self._refuse_header("the file is empty; a header is needed" if self.place == "line" else "no columns")
+            self._refuse_header("the file is empty; it needs a header" if self.place == "line" else "no columns")
         if len(header) > _MOST_COLUMNS:
-            self._refuse_header(f"{len(header)} columns; at most {_MOST_COLUMNS}")
+            self._refuse_header(f"{len(header)} columns; the maximum is {_MOST_COLUMNS}")
         doubled = sorted({name for name in header if header.count(name) > 1})
         if doubled[:1] == [""]:
-            self._refuse_header(f"{header.count('')} columns have no name; name them, or leave them out")
+            self._refuse_header(f"{header.count('')} columns have no name; name or remove them")
         if doubled:
-            self._refuse_header("column appears twice", doubled[0])
+            self._refuse_header("column appears more than once; rename or remove the others", doubled[0])
         needed = [PRISM.name, *(j.column for j in rig.joints), *(POSITION_COLUMNS if positions_required else ())]
         missing = [name for name in needed if name not in header]
         if len(header) == 1 and len(missing) == len(needed):
-            self._refuse_header("one column only: separate columns by commas, and write decimals with a point")
+            self._refuse_header("only one column; separate columns by commas, and use a point for decimals")
         if missing:
             alike = [name for name in header if _plain(name).casefold() == missing[0].casefold()]
-            hint = f" (there is {alike[0]!a})" if alike else ""
+            hint = f" (but there is {alike[0]!a})" if alike else ""
             others = [ascii(name[:_LONGEST_NAME_TOLD]) for name in header if name not in needed][:_MOST_COLUMNS_NAMED]
-            found = f"; found beside them: {', '.join(others)}" if others else ""
+            found = f"; other columns found: {', '.join(others)}" if others else ""
             self._refuse_header(
-                f"column missing{hint} for rig {rig.name!r}; needed: {', '.join(needed)}{found}", missing[0]
+                f"column missing for rig {rig.name!r}{hint}; required: {', '.join(needed)}{found}", missing[0]
             )
         sigmas = [name for name in SIGMA_COLUMNS if name in header]
         if 0 < len(sigmas) < len(SIGMA_COLUMNS):
-            self._refuse_header(f"needs the other two of {', '.join(SIGMA_COLUMNS)} beside it", sigmas[0])
+            reason = f"other sigma columns missing; give all of {', '.join(SIGMA_COLUMNS)}, or none"
+            self._refuse_header(reason, sigmas[0])
 
 
 def read_csv(data: bytes, rig: Rig, source: str, *, positions_required: bool) -> Table:
@@ -230,16 +237,16 @@ def read_csv(data: bytes, rig: Rig, source: str, *, positions_required: bool) ->
 
     Args:
         data: UTF-8, comma, header; a byte-order mark is tolerated.
-        rig: whose columns are wanted.
+        rig: the rig whose columns are read.
         source: file name for messages.
         positions_required: as for `Table`.
 
     Raises:
-        DataError: with file, line, column and reason.
+        DataError: the file is malformed; names file, line, column and reason.
     """
     if b"\0" in data:
         line = data.count(b"\n", 0, data.index(b"\0")) + 1
-        raise DataError(source, "a zero byte, as other encodings have; save the file as UTF-8", line)
+        raise DataError(source, "contains a zero byte, so it is not UTF-8 text; save the file as UTF-8", line)
     text = _Lines(data)
     reader = csv.reader(text, strict=True)
     try:
@@ -262,13 +269,13 @@ def read_frame(frame: DataFrame, rig: Rig, source: str, *, positions_required: b
     """Read a data frame.
 
     Args:
-        frame: of pandas, polars or anything alike; cells that are None or not a number are not measured.
-        rig: whose columns are wanted.
+        frame: a data frame of pandas, polars or a similar library; None and NaN mean "not measured".
+        rig: the rig whose columns are read.
         source: name for messages.
         positions_required: as for `Table`.
 
     Raises:
-        DataError: with row, column and reason.
+        DataError: the frame is malformed; names row, column and reason.
     """
     keys = list(frame.columns)
     header = [str(key) for key in keys]
@@ -279,32 +286,35 @@ def read_frame(frame: DataFrame, rig: Rig, source: str, *, positions_required: b
         raise DataError(source, "no observations")
     for name, cells in columns.items():
         if len(cells) != rows:
-            table.refuse_column(name, f"{len(cells)} cells where the column prism has {rows}")
+            table.refuse_column(name, f"{len(cells)} cells, but column prism has {rows}")
     for number, row in enumerate(zip(*columns.values(), strict=True)):
         table.append(row, number)
     return table
 
 
 def optional_columns(rig: Rig) -> set[str]:
-    """Return the names of all optional columns of numbers but pressures and currents, which no rig needs to name."""
+    """Return the names of all optional columns of numbers, except pressures and currents.
+
+    Pressures and currents are read without an entry in the rig file (`is_read_anyway`).
+    """
     of_joints = {name for joint in rig.joint_names for name in names_of_joint(OF_JOINT, joint)}
     of_channels = {c.column for c in rig.channels if c.name not in rig.joint_names}
     return {*names(CONDITIONS), *of_joints, *of_channels, *(signal.column for signal in rig.signals)}
 
 
 def extra_columns(header: Sequence[str], rig: Rig) -> list[str]:
-    """Return those of a table's columns that are optional columns of numbers, in their order."""
+    """Return the optional columns of numbers among a table's columns, in the order of the header."""
     known = optional_columns(rig)
     return [name for name in header if name in known or is_read_anyway(name)]
 
 
 def _number_columns(header: Sequence[str], rig: Rig) -> set[str]:
-    """Return the names of the columns of a table that are read as numbers."""
+    """Return the names of the columns that are read as numbers if the table has them."""
     return {*(j.column for j in rig.joints), *POSITION_COLUMNS, *SIGMA_COLUMNS, *extra_columns(header, rig)}
 
 
 class _Numbers:
-    """A column of numbers as it is read; its faults are told when the column is wanted."""
+    """A column of numbers as it is read; its first faults are kept, and raised when the column is requested."""
 
     def __init__(self) -> None:
         self.values = array("d")
@@ -324,14 +334,14 @@ class _Numbers:
 
 
 class _Ignored:
-    """A column that is passed over."""
+    """A column that is ignored."""
 
     def __init__(self) -> None:
-        self._numbers: set[float] | None = set()  # two at most; None as soon as a cell is no number
+        self._numbers: set[float] | None = set()  # two at most; None as soon as a cell is not a number
 
     @property
     def varies(self) -> bool:
-        """True if it holds numbers alone, and two that differ."""
+        """True if it holds only numbers, and not all of them are equal."""
         return self._numbers is not None and len(self._numbers) > 1
 
     def append(self, cell: str) -> None:
@@ -344,11 +354,11 @@ class _Ignored:
 
 
 class _Lines:
-    """Lines for the CSV reader, which puts a row together from as many as its quotes ask for: not more than a few.
+    """Lines for the CSV reader, with a limit on the length of a row, which quotes can extend over many lines.
 
     Attributes:
-        taken: characters since it was last set to 0.
-        line: number of the last line.
+        taken: characters read since the caller last set it to 0.
+        line: number of the line that was read last, from 1.
     """
 
     def __init__(self, data: bytes) -> None:
@@ -366,7 +376,7 @@ class _Lines:
         self.line += 1
         self.taken += len(line)
         if self.taken > _LONGEST_ROW:
-            raise csv.Error(f"a row of more than {_LONGEST_ROW:,} characters")
+            raise csv.Error(f"a row has more than {_LONGEST_ROW:,} characters; is a quote left open?")
         return line
 
 
@@ -380,7 +390,7 @@ def _not_utf8(data: bytes, source: str) -> DataError:
 
 
 def _cell(value: object) -> str:
-    """Return a cell of a data frame as a CSV file would have it; whole numbers without a point, as labels have them."""
+    """Return a cell of a data frame as CSV text; whole numbers have no decimal point, so that they can be labels."""
     if isinstance(value, float) and value.is_integer():
         return str(int(value))
     text = str(value)
@@ -391,12 +401,12 @@ def _why_no_number(cell: str) -> str:
     if len(cell) > _LONGEST:
         return f"{cell[:20]!r}... of {len(cell)} characters is not a number"
     if _NUMBER.fullmatch(cell):
-        return f"{cell!r} is beyond what a number can be"
-    advice = "not measured is an empty cell" if cell.lower() in _NO_NUMBERS else "write it as 1234.5 or 1e-3"
+        return f"{cell!r} is too large for a number"
+    advice = "leave cells without a value empty" if cell.lower() in _NO_NUMBERS else "write it as 1234.5 or 1e-3"
     return f"{cell!r} is not a finite number; {advice}"
 
 
 def _plain(text: str) -> str:
-    """Return text as a reader sees it: accents one way, nothing invisible, every space alike."""
+    """Return text as it looks on screen: accents composed, invisible characters removed, white space normalised."""
     seen = "".join(c for c in unicodedata.normalize("NFC", text) if unicodedata.category(c) != "Cf")
     return " ".join(seen.split())

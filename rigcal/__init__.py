@@ -1,4 +1,4 @@
-"""The public face of rigcal: what a program or a notebook needs to make a machine's model true.
+"""The public interface of rigcal, for programs and notebooks that calibrate a machine.
 
     import rigcal
 
@@ -7,8 +7,8 @@
     model = rigcal.calibrate(rig, fixes)
     model.predict(fixes).position_mm
 
-`docs/how-to/notebook.md` is a worked example. Everything else in the packages `calibration`, `daemon`, `drivers` and
-`simulators` may change without notice; these names follow Semantic Versioning.
+`docs/how-to/notebook.md` is a worked example. The names exported here follow Semantic Versioning; everything else in
+the packages `calibration`, `daemon`, `drivers` and `simulators` may change without notice.
 """
 
 from calibration.design.planning import PosePlan

@@ -1,4 +1,4 @@
-"""Calibrate, find what is missing, plan, and use a calibrated model: thin names over the functions of the pipeline."""
+"""Calibrate a rig, find missing effects, plan poses and use a model: thin wrappers around the pipeline."""
 
 from __future__ import annotations
 
@@ -53,28 +53,28 @@ class Model:
     def load(cls, directory: str | Path) -> Model:
         """Read a model directory.
 
-        The files are first loaded by a child process with limits, so that a damaged or hostile model cannot end this
-        one; that takes a second or two for a model that this process has not met.
+        A child process with resource limits loads the files first, so that a damaged or hostile model cannot crash this
+        process. This takes a second or two for a model that this process has not loaded before.
 
         Args:
-            directory: as `save` or `rigcal calibrate --out` wrote it.
+            directory: a directory that `save` or `rigcal calibrate --out` wrote.
 
         Raises:
-            ModelError: not a model, truncated, edited, or of another version.
+            ModelError: the directory is not a model, or is truncated, edited or of an unsupported version.
         """
         return cls(read_model(Path(directory)))
 
     def save(self, directory: str | Path) -> str:
-        """Write a model directory; a model that is there is replaced in one step.
+        """Write a model directory; an existing model in it is replaced atomically.
 
         Args:
-            directory: new, empty, or of a model.
+            directory: a new or empty directory, or one that holds a model.
 
         Returns:
-            SHA-256 of the manifest, which names the model.
+            SHA-256 of the manifest, which identifies the model.
 
         Raises:
-            ModelError: the directory holds something else.
+            ModelError: the directory holds something other than a model.
         """
         return write_model(Path(directory), self.data)
 
@@ -85,26 +85,26 @@ class Model:
 
     @property
     def parameters(self) -> tuple[ParameterEstimate, ...]:
-        """Every identified constant with its standard error: deviations from nominal, mm or rad."""
+        """All identified constants, as deviations from nominal with their standard errors, mm or rad."""
         return self.data.parameters
 
     @property
     def effects(self) -> tuple[FittedEffect, ...]:
-        """The named effects on top of the kinematics.
+        """The named effects that the model has in addition to its kinematics.
 
-        `reported` of an effect has the numbers that reports list. Their standard errors count what the loads of the
-        masses leave open; those of `coefficients` are of the fit alone.
+        `reported` of an effect holds the numbers that reports list. Their standard errors include the uncertainty of
+        the loads of the masses; the standard errors of `coefficients` are those of the fit alone.
         """
         return self.data.effects
 
     @property
     def noise_mm(self) -> float:
-        """RMS 3-D error that is expected of a new fix."""
+        """Expected RMS 3-D error of a new fix, mm."""
         return self.data.noise_mm
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Sentences about the training data and the fit."""
+        """Warnings about the training data and the fit, as sentences."""
         return self.data.warnings
 
     def predict(self, observations: Observations) -> Prediction:
@@ -115,31 +115,37 @@ class Model:
 
         Returns:
             `position_mm` (n, 3) in the station's frame; `sigma_mm` (n, 3), the standard deviation of a fix about it;
-            `half_mm` (n, 3) and `radius_mm` (n,): a fix is that near with 90 % probability, along each axis and in 3-D.
+            `half_mm` (n, 3) and `radius_mm` (n,), the distances within which a fix lies with 90 % probability, along
+            each axis and in 3-D.
 
         Raises:
-            UnsafeError: a set-up that the model does not know.
+            UnsafeError: the model does not know a set-up.
             CalibrationError: a position is not a finite number.
         """
         return Predictor.of(self.data).predict(observations)
 
     def warnings_for(self, observations: Observations) -> tuple[str, ...]:
-        """Return sentences on what the model was not trained for in these rows; none where it may be used."""
+        """Return warnings about rows that the model was not trained for; empty if it may be used for all of them.
+
+        Args:
+            observations: n rows; positions are not needed.
+        """
         return model_warnings(self.data, observations)
 
     def inverse(self, targets: Observations) -> Inverse:
-        """Compute the joint values that bring prisms to their targets, through effects and residual.
+        """Compute the joint values that bring prisms to their targets, with effects and residual taken into account.
 
         Args:
             targets: n rows whose positions, mm in the station's frame, are the targets and whose joints are the nominal
                 command. Rows of one session, set-up and pose are solved together.
 
         Returns:
-            `observations` with the joint values to command (deg or mm), and `closure_mm` (n,), the distance left.
+            `observations` with the joint values to command (deg or mm), and `closure_mm` (n,), the remaining distance
+            between prism and target.
 
         Raises:
             DataError: a row without a position, or rows of one pose with different commands.
-            UnsafeError: a set-up that the model does not know.
+            UnsafeError: the model does not know a set-up.
         """
         return inverse(self.data, targets)
 
@@ -151,23 +157,24 @@ class Model:
 
         Raises:
             DataError: rows without positions.
-            UnsafeError: a set-up that the model does not know.
+            UnsafeError: the model does not know a set-up.
         """
         return evaluate(self.data, observations)
 
     def export(self, directory: str | Path, format_name: str | None = None) -> tuple[Path, ...]:
-        """Write the model for other programs.
+        """Write the model in formats for other programs.
 
         Args:
-            directory: where to; it is made where it is missing.
-            format_name: as `rigcal model export --format` has it (docs/how-to/export.md); `json` and `grid` by default.
+            directory: output directory; created if it does not exist.
+            format_name: a format of `rigcal model export --format` (docs/how-to/export.md); `json` and `grid` by
+                default.
 
         Returns:
-            The files that were written.
+            Paths of the files that were written.
 
         Raises:
-            DataError: an unknown format, or one that needs a library that is not installed.
-            OSError: the file system refuses.
+            DataError: the format is unknown, or needs a library that is not installed.
+            OSError: the files cannot be written.
         """
         out = Path(directory)
         out.mkdir(parents=True, exist_ok=True)
@@ -190,21 +197,24 @@ def calibrate(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> Model:
-    """Calibrate a rig: identify kinematics and effects, learn what remains where it helps on held-out groups.
+    """Calibrate a rig: identify kinematics and effects, and learn the residual if that helps on held-out groups.
 
     Args:
-        rig: as `Rig.read` gives it.
+        rig: rig description from `Rig.read`.
         observations: n training rows with positions, mm in the station's frame.
         prior: `recalibration` trusts the rig file's build tolerances, `as-built` estimates their scale.
         method: `default`, or a published one: `pde-paper`, `km`, `skcm`, `rbf-tcm`.
-        effects: `auto` for those that the data ask for, `none`, or FAMILY@WHERE,... by name.
-        residual: `default` for whichever learner is best or none; `none`, `rbfn`, `lightgbm`, `chain`, `gp`.
-        seed: of everything random; the same seed gives the same model.
-        progress: told the share done, 0 to 1, and what is going on.
+        effects: `auto` to select effects by the data, `none`, or names: FAMILY@WHERE,...
+        residual: `default` for the best learner, or for none if none helps; `none`, `rbfn`, `lightgbm`, `chain`, `gp`.
+        seed: seed of all random numbers; the same seed gives the same model.
+        progress: called with the share done, 0 to 1, and a message about the current step.
+
+    Returns:
+        The calibrated model.
 
     Raises:
         DataError: rows without positions, prisms that the rig lacks, data that the method or an effect cannot use.
-        UnsafeError: too few fixes, mirrored coordinates, another rig's data.
+        UnsafeError: too few fixes, mirrored coordinates, or data of a different rig.
         ValueError: an unknown prior, method, effect or residual, or a rig that was not read from a text.
     """
     _require_one_of("prior", prior, get_args(Prior))
@@ -229,21 +239,22 @@ def find_gap(
     """Find where simulation and measurement disagree, and name the effect that is missing.
 
     Args:
-        rig: as `Rig.read` gives it.
+        rig: rig description from `Rig.read`.
         observations: n training rows with positions, mm in the station's frame.
-        holdout: further rows, at set-ups of the training rows, that no fit sees.
-        prior: as `calibrate`.
-        families: of effects that may be named; the whole library by default.
-        seed: of everything random.
-        progress: told the share done, 0 to 1, and what is going on.
+        holdout: further rows, at set-ups of the training rows, that are not used in any fit.
+        prior: as for `calibrate`.
+        families: families of effects that may be named; the whole library by default.
+        seed: seed of all random numbers.
+        progress: called with the share done, 0 to 1, and a message about the current step.
 
     Returns:
-        `verdict` (`named`, `none`, `indistinguishable`, `unidentified`), `effects`, the evidence, what to measure next;
-        `Model(result.model)` is the model that has the named effects.
+        `verdict` (`named`, `none`, `indistinguishable`, `unidentified`), `effects`, the evidence, and what to measure
+        next; `Model(result.model)` is the model with the named effects.
 
     Raises:
         DataError: rows without positions, prisms that the rig lacks.
-        UnsafeError: too few fixes, mirrored coordinates, another rig's data, a held-out set-up that is not trained on.
+        UnsafeError: too few fixes, mirrored coordinates, data of a different rig, or a held-out set-up that has no
+            training rows.
         ValueError: an unknown prior or family, or a rig that was not read from a text.
     """
     _require_one_of("prior", prior, get_args(Prior))
@@ -267,26 +278,27 @@ def plan(
 ) -> PosePlan:
     """Plan which poses to measure.
 
-    Without a model the poses determine the parameters best; with one they lower its expected error most.
+    Without a model, the poses are those that determine the parameters best; with a model, those that lower its expected
+    error most.
 
     Args:
         rig: the rig description.
-        poses: how many.
-        model: what is known already.
-        station_mm: (3,) place of a new station set-up in the base frame.
-        setup: which of the model's set-ups; by default the one whose base is known best.
-        floor_mm: height of the floor over the base's origin.
-        separate: effects to tell apart, each FAMILY@WHERE.
-        seed: of the candidates.
-        progress: told the share done, 0 to 1, and what is going on.
+        poses: number of poses.
+        model: a model of an earlier calibration, from which planning starts.
+        station_mm: (3,) position of a new station set-up in the base frame, mm.
+        setup: a set-up of the model; by default the one whose base is known best.
+        floor_mm: height of the floor above the base's origin, mm.
+        separate: effects that the poses should distinguish, each FAMILY@WHERE.
+        seed: seed of the candidate poses.
+        progress: called with the share done, 0 to 1, and a message about the current step.
 
     Raises:
-        DataError: fewer reachable poses than asked for; an effect that poses do not show.
-        UnsafeError: a model of another rig, or without that set-up; no reachable pose in view.
-        ValueError: no pose is asked for, an unknown effect, or a station's place that is not three finite numbers.
+        DataError: fewer reachable poses than requested; an effect that poses cannot show.
+        UnsafeError: a model of a different rig, or without that set-up; no reachable pose in view.
+        ValueError: `poses` is below 1, an effect is unknown, or `station_mm` is not three finite numbers.
     """
     if poses < 1:
-        raise ValueError(f"poses is {poses}; ask for one at least")
+        raise ValueError(f"poses is {poses}; give 1 or more")
     for effect in separate:
         _require_one_of("separate", effect.partition("@")[0], sorted(library()))
     station = None if station_mm is None else np.array(station_mm, dtype=np.float64)
@@ -306,7 +318,7 @@ def plan(
 
 def _require_one_of(name: str, value: str, known: Collection[str]) -> None:
     if value not in known:
-        raise ValueError(f"{name}: {value!r} is unknown; there are {', '.join(known)}")
+        raise ValueError(f"{name}: {value!r} is unknown; give one of {', '.join(known)}")
 
 
 def _run(seed: int, progress: Progress | None) -> Run:
@@ -315,5 +327,5 @@ def _run(seed: int, progress: Progress | None) -> Run:
 
 def _text(rig: Rig) -> str:
     if not rig.text:
-        raise ValueError("the rig was not read from a text, which has to travel in the model; use Rig.read")
+        raise ValueError("the rig has no text, which a model must contain; read the rig with Rig.read")
     return rig.text

@@ -27,23 +27,23 @@ def open_store(path: str | Path, frames: FrameLibrary = "pandas") -> Store:
 
     Args:
         path: the daemon's `rigcal.sqlite`.
-        frames: which library's data frames are given; it has to be installed.
+        frames: library of the data frames that the store returns; it must be installed.
 
     Raises:
         StoreError: there is no store, or it cannot be read.
-        ValueError: another library.
+        ValueError: `frames` is neither `pandas` nor `polars`.
     """
     if frames not in ("pandas", "polars"):
-        raise ValueError(f"{frames!r} is unknown; there are pandas and polars")
+        raise ValueError(f"frames: {frames!r} is unknown; give one of pandas, polars")
     return Store(Reader(Path(path)), frames)
 
 
 class Store:
-    """A store, read-only; a context manager. Belongs to the thread that opened it.
+    """A read-only store and context manager; only the thread that opened it may use it.
 
     Args:
         reader: the connection.
-        frames: which library's data frames are given.
+        frames: library of the data frames that the store returns.
     """
 
     def __init__(self, reader: Reader, frames: FrameLibrary) -> None:
@@ -66,18 +66,18 @@ class Store:
         return self._frame(all_sessions(self._reader))
 
     def observations(self, sessions: Sequence[str] = ()) -> pd.DataFrame | pl.DataFrame:
-        """Return the observations of sessions, oldest first, with the reason why calibration must not use them.
+        """Return the observations of sessions, oldest first, including those that calibration must not use.
 
         Args:
             sessions: ids; all by default.
 
         Returns:
-            One row a fix: `session_id`, `setup_id`, `prism`, `pose`, `utc_ns`, `x_mm`, `y_mm`, `z_mm` in the station's
-            frame, `sigma_x_mm` and so on, `dwell_s`, `excluded` (None where calibration may use it), and the joints and
-            signals under their column names (`theta1_deg`, `L2_mm`, ...).
+            One row per fix: `session_id`, `setup_id`, `prism`, `pose`, `utc_ns`, `x_mm`, `y_mm`, `z_mm` in the
+            station's frame, `sigma_x_mm` and so on, `dwell_s`, `excluded` (the reason why calibration must not use the
+            fix, else None), and the joints and signals under their column names (`theta1_deg`, `L2_mm`, ...).
 
         Raises:
-            DataError: no such session.
+            DataError: there is no such session.
         """
         self._require(sessions)
         return self._frame(all_observations(self._reader, sessions))
@@ -86,24 +86,24 @@ class Store:
         """Return the rig of sessions and the observations that calibration may use, as the daemon's jobs do.
 
         Args:
-            sessions: ids, of one rig; the newest one's description counts.
+            sessions: ids of sessions of one rig. The returned rig is that of the newest session.
 
         Raises:
-            DataError: no such session, no observation that may be used, or sessions whose rig files differ in what
-                the readings mean.
+            DataError: there is no such session, no observation may be used, or the rig files of the sessions differ in
+                the meaning of readings.
         """
         found = self._require(sessions)
         if not found:
-            raise DataError(str(self._reader.path), "no session is named")
+            raise DataError(str(self._reader.path), "no session given; give at least one")
         ages = [row["id"] for row in all_sessions(self._reader)]
         newest = max(found, key=lambda row: ages.index(row["id"]))
         rig = parse_rig(str(newest["rig_text"]), f"the rig of session {newest['id']}")
         return rig, Observations.from_csv(sessions_csv(self._reader, rig, sessions).decode(), rig)
 
     def _require(self, sessions: Sequence[str]) -> list[dict[str, Any]]:
-        """Return the rows of sessions; DataError where there is none of a name."""
+        """Return the rows of sessions; raise DataError for an unknown id."""
         if isinstance(sessions, str):
-            raise DataError(str(self._reader.path), f"give a list of sessions: [{sessions!r}]")
+            raise DataError(str(self._reader.path), f"sessions is a string; give a list: [{sessions!r}]")
         rows = []
         for name in sessions:
             row = session(self._reader, name)

@@ -1,1 +1,1 @@
-"""Evaluation of a model on observations, and comparison with the live one."""
+"""Evaluation of a model on observations, and comparison with the live model."""

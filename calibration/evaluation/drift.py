@@ -1,4 +1,4 @@
-"""Drift of a live model: its errors on a check session beside those it predicts, standstill by standstill."""
+"""Drift of a live model: its errors on a check session relative to the predicted errors, per standstill."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ _BASE = 6  # parameters of a base transform
 
 @dataclass(frozen=True)
 class Check:
-    """A check session held against a model.
+    """Comparison of a check session with a model.
 
     Attributes:
-        scores: of its standstills, in the order of the rows: as `cusum.score`.
+        scores: score of each standstill, in the order of the rows, as returned by `statistics.score`.
         fixes: number of fixes.
-        ratio: RMS of the errors over their formal standard deviation.
-        refitted: set-ups that the model does not know, whose base was fitted on these very fixes.
-        left_out: unknown set-ups whose fixes cannot place a base.
+        ratio: RMS of the errors divided by their formal standard deviation.
+        refitted: set-ups that the model does not know, whose base was fitted on these same fixes.
+        left_out: unknown set-ups whose fixes cannot determine a base.
     """
 
     scores: tuple[float, ...]
@@ -41,15 +41,15 @@ class Check:
 
 @one_blas_thread()
 def check(model: CalibratedModel, observations: Observations) -> Check:
-    """Hold a check session against a model that was not trained on it.
+    """Compare a check session with a model that was not trained on it.
 
     Args:
-        model: the live one.
+        model: the live model.
         observations: rows of the session, with positions, in the order of time.
 
     Raises:
         DataError: no rows, or rows without positions.
-        UnsafeError: no set-up at which the model can be placed.
+        UnsafeError: no set-up of the session has a known base or fixes that can determine one.
     """
     require_positions(observations)
     squares = np.full(len(observations), np.nan)
@@ -69,14 +69,14 @@ def check(model: CalibratedModel, observations: Observations) -> Check:
         if placed is None:
             left_out.append(setup)
             continue
-        # The fit has taken its share of these errors, and predicts that share on top of the noise.
+        # The fitted base absorbs part of these errors, and its uncertainty adds to their predicted variance
         squares[rows] = _mean_squares(placed, here) * (3 * len(rows) + _BASE) / spare
         refitted.append(setup)
     known = np.isfinite(squares)
     if not known.any():
         raise UnsafeError(
-            f"the check shots place no base: at set-up {left_out[0]!r}, which the live model does not know, more than "
-            "two fixes that are not on a line are needed"
+            f"the check shots cannot determine the base transform: at set-up {left_out[0]!r}, which the live model "
+            "does not know, measure at least three fixes that are not on a line"
         )
     squares, labels = squares[known], standstill_labels(observations.select(known))
     found = [float(squares[labels == label].mean()) for label in dict.fromkeys(labels.tolist())]
@@ -90,7 +90,7 @@ def check(model: CalibratedModel, observations: Observations) -> Check:
 
 
 def _mean_squares(model: CalibratedModel, observations: Observations) -> Floats:
-    """(n,) squared errors over their formal variance, mean of the three coordinates."""
+    """Return (n,) squared errors divided by their formal variance, averaged over the three coordinates."""
     predicted = Predictor.of(model).predict(observations)
     squares: Floats = (((observations.position_mm - predicted.position_mm) / predicted.formal_mm) ** 2).mean(axis=1)
     return squares

@@ -26,8 +26,8 @@ from calibration.observations import Floats, Observations, are_among, data_sha25
 from calibration.residual.conformal import Coverage
 from calibration.residual.learners import tree_importance
 
-_STRANGE = 3.0  # times the expected error, in the median; a right model's are 0.9
-_STRANGE_BODY = 30.0  # times the scatter of the training: more than calibrated models leave far from home; not measured
+_STRANGE = 3.0  # median ratio of error to expected error; 0.9 for a correct model
+_STRANGE_BODY = 30.0  # median error over training scatter; above calibrated models far from training; not measured
 _LEAST_TO_JUDGE = 10
 _FEATURES_SHOWN = 10  # as in Zhou et al. 2022, Fig. 10
 STAGES = ("nominal", "geometric", "effects", "hybrid")
@@ -35,20 +35,20 @@ STAGES = ("nominal", "geometric", "effects", "hybrid")
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Errors of every stage of a model on measured rows, and what they say of model and rows.
+    """Errors of every stage of a model on measured rows, with warnings about model and rows.
 
     Attributes:
-        model: the model, with the base refitted where that was asked for.
+        model: the model, with the base refitted if that was requested.
         observations: the rows.
         errors_mm: stage -> (n, 3) measured minus modelled, in the station's frame.
         sigma_mm: (n, 3) standard deviation that the model predicts for the hybrid stage's errors.
-        coverage: share of the hybrid stage's errors inside their intervals; where the base was refitted on these rows,
-            intervals that were counted on the other half of them.
-        outliers: rows farther off than noise explains.
-        fitted: how many of the rows the model was fitted to.
-        warnings: about model and data.
-        axes: the model held against the axes that single-joint sweeps among the rows show.
-        expected: accuracy that the model expects over the work volume; None where the rig can take no pose.
+        coverage: share of the hybrid stage's errors inside their intervals. If the base was refitted on these rows, the
+            intervals of each half of the rows are determined from the other half.
+        outliers: rows with errors larger than noise explains.
+        fitted: number of the rows that the model was fitted to.
+        warnings: warnings about model and data.
+        axes: comparison of the model with the joint axes that single-joint sweeps among the rows show.
+        expected: accuracy that the model expects over the work volume; None if the rig has no reachable pose there.
     """
 
     model: CalibratedModel
@@ -66,12 +66,20 @@ class Evaluation:
         return len(self.observations)
 
     def stages(self, prism: str | None = None) -> list[dict[str, str | float]]:
-        """Mean, RMS, greatest and standard deviation of the 3-D error of every stage, over all rows or one prism's."""
+        """Return mean, RMS, maximum and standard deviation of the 3-D error of every stage.
+
+        Args:
+            prism: use only the rows of this prism; all rows by default.
+        """
         rows = np.ones(len(self), dtype=bool) if prism is None else self.observations.prism == prism
         return [{"stage": stage, **statistics(sizes_mm(self.errors_mm[stage][rows]))} for stage in STAGES]
 
     def as_dict(self, seconds: float) -> dict[str, object]:
-        """Return the JSON object of `calibrate` and `evaluate` (docs/reference/formats.md); `seconds` is measured."""
+        """Return the JSON object of `calibrate` and `evaluate` (docs/reference/formats.md).
+
+        Args:
+            seconds: measured duration.
+        """
         return {
             "rig": self.model.rig.name,
             "n": len(self),
@@ -104,10 +112,11 @@ def evaluate(model: CalibratedModel, observations: Observations, *, refit_base: 
     Args:
         model: the model.
         observations: rows with positions.
-        refit_base: fit the base transform of every set-up, and nothing else, on these rows, for each stage by itself.
+        refit_base: fit only the base transform of every set-up on these rows, for each stage separately.
 
     Raises:
-        UnsafeError: a set-up that the model does not know, or whose base cannot be placed with these rows.
+        DataError: no rows, or rows without positions.
+        UnsafeError: the model does not know a set-up, or these rows cannot determine its base.
     """
     require_positions(observations)
     effects, learned, left_out = model, model.residual is not None, None
@@ -145,7 +154,7 @@ def evaluate(model: CalibratedModel, observations: Observations, *, refit_base: 
     if outliers and not (strange or rounded or is_training):
         warnings.append(
             f"{len(outliers)} of {len(observations)} fixes are farther off than noise explains, "
-            f"{farthest(observations, outliers)}: the errors count them"
+            f"{farthest(observations, outliers)}; the errors include them"
         )
     coverage = prediction.coverage(errors["hybrid"]) if left_out is None else left_out.coverage()
     axes = _axes(effects, observations)
@@ -173,28 +182,28 @@ def _fitted(model: CalibratedModel, observations: Observations) -> int:
 
 
 def _strange(error_mm: Floats, formal_mm: Floats, noise_mm: float, *, refit_base: bool) -> Iterator[str]:
-    """Warn of errors far beyond the expected: the model is not of this machine, or no longer.
+    """Yield a warning if errors are far above the expected ones: the model does not, or no longer, fit this machine.
 
-    A base that was fitted to these very rows counts their scatter in its own uncertainty, which then explains errors
-    of any size: they are held against the scatter of the training as well.
+    The uncertainty of a base that was fitted to these same rows includes their scatter and can explain errors of any
+    size. With such a base, the errors are therefore also compared with the scatter of the training.
     """
     size_mm = sizes_mm(error_mm)
     times, most = float(np.median(size_mm / sizes_mm(formal_mm))), _STRANGE
-    where, moved, scale = "", "a moved base or prism", "the expected"
+    where, moved, scale = "", "a moved base or prism", "the expected error"
     if times <= most and refit_base:
         times, most = float(np.median(size_mm)) / noise_mm, _STRANGE_BODY
-        where, moved, scale = ", wherever its base stands", "a moved prism", "the scatter of its training"
+        where, moved, scale = ", whatever its base transform", "a moved prism", "the scatter of its training"
     if len(error_mm) >= _LEAST_TO_JUDGE and times > most:
         yield (
             f"the model does not describe this data{where}: half of the fixes are off by more than {times:,.0f} times "
-            f"{scale}; another machine or rig file, {moved}, or a column that was read differently"
+            f"{scale}; check for another machine or rig file, {moved}, or a column that was read differently"
         )
 
 
 def _axes(model: CalibratedModel, observations: Observations) -> tuple[AxisCheck, ...]:
-    """The model against the single-joint sweeps among the rows, with the joints where the effects have them.
+    """Compare the model with the single-joint sweeps among the rows, with joint values corrected by the effects.
 
-    The uncertainty of the effects' coefficients is left out, which makes an axis disagree a little sooner.
+    The uncertainty of the effects' coefficients is neglected, so an axis is reported as disagreeing slightly earlier.
     """
     parameters = len(model.chain)
     axes = find_axes(model.chain, averaged(model.chain, Predictor.of(model).corrected(observations)))
@@ -209,7 +218,7 @@ def _expected(model: CalibratedModel) -> ExpectedAccuracy | None:
 
 
 def require_positions(observations: Observations) -> None:
-    """Raise DataError unless there are rows, each with a measured position."""
+    """Raise DataError if there are no rows, or a row has no measured position."""
     if len(observations) == 0:
         raise DataError("observations", "there are none")
     if not np.isfinite(observations.position_mm).all():
@@ -217,7 +226,7 @@ def require_positions(observations: Observations) -> None:
 
 
 def sizes_mm(error_mm: Floats) -> Floats:
-    """Return the sizes (n,) of (n, 3) errors."""
+    """Return the norms (n,) of (n, 3) errors."""
     return np.asarray(np.linalg.norm(error_mm, axis=1))
 
 

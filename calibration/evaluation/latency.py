@@ -1,4 +1,4 @@
-"""Latency of fixes against the joints' readings, from fixes of a moving boom."""
+"""Latency of fixes relative to the joint readings, estimated from fixes of a moving boom."""
 
 from __future__ import annotations
 
@@ -18,23 +18,23 @@ from calibration.observations import Floats, Observations
 PAUSE_S = 1.0  # between two motions
 LEAST_MOTIONS = 5
 LEAST_FIXES = 30
-LEAST_SPEED_MM_PER_S = 5.0  # slower fixes tell of the model's errors alone
-LAG_MM = 5.0  # standard deviation of what play and friction make the boom stay behind, whatever its speed
-OFFSET_MM = 50.0  # of a mean error of the model where the boom moved
-_OUTLIER = 5.0  # times the typical error
+LEAST_SPEED_MM_PER_S = 5.0  # at lower speeds the errors of the model dominate
+LAG_MM = 5.0  # standard deviation of the lag of the boom by play and friction, independent of its speed
+OFFSET_MM = 50.0  # standard deviation of the model's mean error where the boom moved
+_OUTLIER = 5.0  # multiple of the typical error
 _ROUNDS = 3
 
 
 @dataclass(frozen=True)
 class Latency:
-    """Delay of fixes against the joints' readings, as estimated from fixes of a moving boom.
+    """Delay of fixes relative to the joint readings, estimated from fixes of a moving boom.
 
     Attributes:
-        seconds: from the instant at which the boom was there to the fix's stamp, less that of the joints' readings; a
-            delay that the joiner has taken away, and one that is an effect of the model, are not in it.
-        standard_error_s: of it; motions are taken as independent, the fixes of one are not.
-        fixes: number of fixes that it was estimated from.
-        motions: number of motions that these belong to.
+        seconds: delay from the true instant of a fix to its timestamp, minus the same delay of the joint readings. It
+            does not include a delay that the joiner has already removed, or one that is an effect of the model.
+        standard_error_s: standard error of `seconds`; motions are treated as independent, fixes of one motion are not.
+        fixes: number of fixes used for the estimate.
+        motions: number of motions that these fixes belong to.
     """
 
     seconds: float
@@ -47,16 +47,20 @@ class Latency:
 def estimate_latency(model: CalibratedModel, observations: Observations) -> Latency | str:
     """Estimate the latency of one session's fixes.
 
-    The error of a fix is regressed on the prism's velocity, beside a constant error and a lag along the motion that
-    play and friction make. Speeds that differ tell the lag from the latency; where they do not, the standard error
-    says so. Only the difference of the two links' latencies shows in motion: that of one alone needs a common clock.
+    The error of a fix is regressed on the prism's velocity, together with a constant error and a lag along the motion
+    due to play and friction. Different speeds separate the lag from the latency; without them the standard error is
+    large. Motion shows only the difference between the latencies of the two links: the latency of one link alone needs
+    a common clock.
 
     Args:
-        model: identified without these fixes, or with few of them.
+        model: model that was identified without these fixes, or with few of them.
         observations: moving fixes with positions, `time_s` and rates, at one set-up, in the order of time.
 
     Returns:
-        The latency, or why there is none, a clause.
+        The latency, or a clause with the reason why it is not known.
+
+    Raises:
+        DataError: no rows, or rows without positions.
     """
     require_positions(observations)
     time_s = observations.extra.get("time_s")
@@ -74,7 +78,7 @@ def estimate_latency(model: CalibratedModel, observations: Observations) -> Late
     motion = np.cumsum(np.diff(time_s, prepend=-np.inf) > PAUSE_S)
     error_mm = observations.position_mm - predictor.predict(observations).position_mm
     rows = is_quick & np.isfinite(error_mm).all(axis=1)
-    few = f"it takes {LEAST_FIXES} fixes in {LEAST_MOTIONS} motions"
+    few = f"{LEAST_FIXES} fixes in {LEAST_MOTIONS} motions are needed"
     for _ in range(_ROUNDS):
         if rows.sum() < LEAST_FIXES or len(np.unique(motion[rows])) < LEAST_MOTIONS:
             return f"{few}; there are {rows.sum()} in {len(np.unique(motion[rows]))}"
@@ -94,13 +98,13 @@ def estimate_latency(model: CalibratedModel, observations: Observations) -> Late
 
 
 def _design(velocity: Floats, speed: Floats) -> Floats:
-    """(n, 3, 5) columns: velocity, direction of motion, and a constant error of each coordinate."""
+    """Return (n, 3, 5) columns: velocity, direction of motion, and a constant error of each coordinate."""
     constant = np.broadcast_to(np.eye(3), (len(velocity), 3, 3))
     return np.concatenate([velocity[:, :, None], (velocity / speed[:, None])[:, :, None], constant], axis=2)
 
 
 def _fit(design: Floats, error_mm: Floats, motion: NDArray[np.int_]) -> tuple[Floats, Floats]:
-    """Ridge regression with the covariance of its coefficients, robust to errors shared within a motion."""
+    """Return coefficients of a ridge regression and their covariance, robust to errors shared within a motion."""
     precision = np.diag([0.0, LAG_MM**-2, *[OFFSET_MM**-2] * 3])
     columns = design.reshape(-1, design.shape[2])
     variance = 1.0

@@ -17,22 +17,23 @@ from calibration.numerics.statistics import WORTHWHILE, paired_test
 from calibration.observations import Floats, Observations, Strings
 from calibration.residual.folds import standstill_labels
 
-_LEAST_STANDSTILLS = 2  # one shows nothing: its fixes share their errors
+_LEAST_STANDSTILLS = 2  # one is not enough: its fixes share their errors
 
 
 @dataclass(frozen=True)
 class HeldOutComparison:
-    """A candidate beside what it would replace, on held-out observations.
+    """Comparison of a candidate with the model that it would replace, on held-out observations.
 
     Attributes:
-        against: the live model, or the candidate's own nominal stage where there is none.
-        is_better: True if it may go live. Against a live model it must lower the error by more than chance; against
-            its own nominal stage it must raise it neither in all nor at most standstills, of two or more.
+        against: the live model, or the candidate's own nominal stage if there is no live model.
+        is_better: True if the candidate may go live. Compared with a live model, it must reduce the error by more than
+            chance. Compared with its own nominal stage, it must have two or more standstills and increase the error
+            neither overall nor at most standstills.
         before_mm, after_mm: RMS 3-D error without and with the candidate.
         p: probability of such a gain by chance.
-        fixes, standstills: numbers used; the test's groups are standstills, and 100 mm cells of moving fixes.
-        refitted: set-ups unknown to one of the models, whose base transform was fitted on these very fixes for both.
-        left_out: unknown set-ups whose fixes cannot place a base.
+        fixes, standstills: numbers used. The groups of the test are standstills, and 100 mm cells for moving fixes.
+        refitted: set-ups unknown to one of the models, whose base transform was fitted on these same fixes for both.
+        left_out: unknown set-ups whose fixes cannot determine a base.
     """
 
     against: Literal["live", "nominal"]
@@ -47,18 +48,18 @@ class HeldOutComparison:
 
     @property
     def sentence(self) -> str:
-        """The verdict."""
+        """The verdict as a sentence."""
         other = "the live model" if self.against == "live" else "its own nominal stage"
         where = (
             f"on {self.fixes} held-out fixes of {self.standstills} standstills its error is {self.after_mm:.3g} mm "
-            f"RMS, that of {other} {self.before_mm:.3g} mm"
+            f"RMS, compared with {self.before_mm:.3g} mm of {other}"
         )
         if self.against == "nominal":
             if self.is_better:
                 return f"{where}: enough, as there is no live model to beat"
             few = self.standstills < _LEAST_STANDSTILLS
-            shown = "larger, in all or at most standstills" if not few else "too few standstills to tell"
-            return f"{where}: {shown}; more check fixes must show that it is no larger"
+            shown = "larger, overall or at most standstills" if not few else "too few standstills to decide"
+            return f"{where}: {shown}; more check fixes must show that it is not larger"
         where += f" (a gain by chance: p = {self.p:.2g})"
         if self.is_better:
             return f"{where}: better beyond chance"
@@ -66,7 +67,7 @@ class HeldOutComparison:
         return f"{where}: no gain beyond chance{more}"
 
     def as_dict(self) -> dict[str, object]:
-        """Return all attributes and the sentence as a JSON object, as the store keeps it."""
+        """Return all attributes and the sentence as a JSON object for the store."""
         return asdict(self) | {"sentence": self.sentence}
 
 
@@ -74,16 +75,16 @@ class HeldOutComparison:
 def compare_held_out(
     candidate: CalibratedModel, live: CalibratedModel | None, observations: Observations
 ) -> HeldOutComparison:
-    """Hold a candidate against the live model.
+    """Compare a candidate with the live model.
 
     Args:
         candidate: the model that would go live.
-        live: the one that is; None where there is none, or where it describes a machine with other joints or prisms.
-        observations: rows with positions that neither was trained on.
+        live: the live model, or None. It is ignored if its rig has other joints, or lacks a prism of the observations.
+        observations: rows with positions that neither model was trained on.
 
     Raises:
         DataError: no rows, or rows without positions.
-        UnsafeError: no set-up at which both can be placed.
+        UnsafeError: there is no set-up where the base of both models is known or can be determined.
     """
     require_positions(observations)
     if live is not None and not _describes(live, observations):
@@ -112,11 +113,11 @@ def compare_held_out(
         labels.append(standstill_labels(rows))
     if not before:
         raise UnsafeError(
-            f"the held-out fixes place no base: at set-up {left_out[0]!r}, which a model does not know, three fixes "
-            "that are not on a line are needed"
+            f"the held-out fixes cannot determine the base transform: at set-up {left_out[0]!r}, which a model does "
+            "not know, measure at least three fixes that are not on a line"
         )
     gain = paired_test(np.concatenate(before), np.concatenate(after), np.concatenate(labels))
-    # Where shots are gross outliers the RMS is theirs, and nearly the same for any two models: so both must agree.
+    # Gross outliers dominate the RMS and are nearly equal for any two models: so RMS and standstills must both agree.
     no_worse = gain.groups >= _LEAST_STANDSTILLS and gain.after_mm <= gain.before_mm and gain.no_worse >= 0.5
     return HeldOutComparison(
         against="nominal" if live is None else "live",
@@ -132,6 +133,6 @@ def compare_held_out(
 
 
 def _describes(model: CalibratedModel, observations: Observations) -> bool:
-    """True if the model's rig has the joints and prisms of the observations."""
+    """Return True if the model's rig has the joints and prisms of the observations."""
     prisms = set(observations.prism.tolist())
     return set(model.rig.joint_names) == set(observations.joints) and prisms <= set(model.rig.prism_names)

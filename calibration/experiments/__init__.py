@@ -1,1 +1,1 @@
-"""Comparisons of methods on the same data."""
+"""Comparisons of calibration methods on the same data."""

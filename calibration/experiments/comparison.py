@@ -1,4 +1,4 @@
-"""Every method, and every residual on the default's kinematics, fitted and judged on the same rows."""
+"""Comparison of all methods, and of all residuals on the default kinematics, fitted and evaluated on the same rows."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ METHODS = ("km", "skcm", "rbf-tcm", "default", "pde-paper")  # in the order of t
 
 @dataclass(frozen=True)
 class Comparison:
-    """Figures of all methods side by side, on the same rows.
+    """Results of all methods on the same rows.
 
     Attributes:
-        rig: name.
-        training, held_out: how many rows.
-        results: the nominal model first, then `METHODS`, with `RESIDUALS` above the default.
-        warnings: what all methods that apply have to say of data and fit.
+        rig: name of the rig.
+        training, held_out: numbers of rows.
+        results: the nominal model first, then `METHODS`, with `RESIDUALS` before the default.
+        warnings: warnings about data and fit that all applicable methods share.
     """
 
     rig: str
@@ -41,17 +41,17 @@ class Comparison:
 
     @property
     def noise_mm(self) -> float | None:
-        """RMS 3-D error that station and encoders explain on the held-out rows; None where no method says so."""
+        """RMS 3-D error that station and encoders explain on the held-out rows; None if no method returned it."""
         return next((r.noise_mm for r in reversed(self.results) if r.noise_mm is not None), None)
 
     def lowest(self, figure: str) -> frozenset[str]:
-        """Methods with the lowest value of one of `FIGURES`."""
+        """Return the methods with the lowest value of one of `FIGURES`."""
         values = {str(row["method"]): row[figure] for row in (result.as_dict() for result in self.results)}
         known = {method: value for method, value in values.items() if isinstance(value, float)}
         return frozenset(method for method, value in known.items() if value == min(known.values()))
 
     def as_dict(self) -> dict[str, object]:
-        """Return a JSON object: the rig, numbers of rows, the noise, each method's figures and the warnings."""
+        """Return a JSON object with rig, numbers of rows, noise, figures of each method, and warnings."""
         return {
             "rig": self.rig,
             "n": self.training,
@@ -76,26 +76,27 @@ def compare(
     residuals: Sequence[str] = RESIDUALS,
     run: Run = DEFAULT_RUN,
 ) -> Comparison:
-    """Calibrate by every method and evaluate each one's last stage on the held-out rows.
+    """Calibrate by every method and evaluate the last stage of each model on the held-out rows.
 
-    The default method identifies once; every one of `RESIDUALS` is then learned from what this one model leaves.
+    The default method identifies the kinematics and effects once; all `RESIDUALS` are then learned from the errors of
+    this model.
 
     Args:
         rig: the rig description.
         rig_text: the TOML that it was read from.
         training: rows to fit.
-        held_out: rows that no method sees.
-        clock: monotonic seconds.
+        held_out: rows that are not used in any fit.
+        clock: function that returns monotonic seconds.
         prior: trust the build tolerances, or estimate their scale.
-        refit_base: fit the base transform of the held-out set-ups, and nothing else, on the held-out rows first.
-        time_limit_s: ends a method's global search.
-        methods: which.
-        residuals: which take part where `default` does.
+        refit_base: first fit only the base transform of the held-out set-ups on the held-out rows.
+        time_limit_s: time limit of each method, after which its global search stops.
+        methods: methods to compare.
+        residuals: residuals to compare, if `default` is one of the methods.
         run: seed, workers and progress.
 
     Raises:
-        UnsafeError: a held-out set-up that the training rows lack, without `refit_base`.
-        CalibrationError: what the default method says (or else the last one), where no method applies.
+        UnsafeError: the training rows lack a held-out set-up, and `refit_base` is False.
+        CalibrationError: no method applies; the error is that of the default method, or else of the last method.
     """
     if not refit_base:
         require_known_setups(training, held_out, REFIT_BASE)
@@ -123,7 +124,7 @@ def compare(
 
 @dataclass(frozen=True)
 class _Task:
-    """The arguments of `compare`; its methods return the nominal model's result first, then their own."""
+    """The arguments of `compare`; the methods return the result of the nominal model first, then their own."""
 
     rig: Rig
     rig_text: str
@@ -135,7 +136,7 @@ class _Task:
     time_limit_s: float | None
 
     def method(self, method: str, run: Run) -> list[MethodResult]:
-        """Calibrate by a method, and evaluate."""
+        """Calibrate by a method and evaluate the model."""
         began = self.clock()
         limited = self._limited(run, began)
         model, trained = calibrate(self.rig, self.rig_text, self.training, prior=self.prior, method=method, run=limited)
@@ -143,7 +144,7 @@ class _Task:
         return self._results(method, trained, evaluate(model, self.held_out, refit_base=self.refit_base), seconds)
 
     def default(self, residuals: Sequence[str], run: Run) -> list[MethodResult]:
-        """Identify by the default method, then train the residuals one by one, and the default's last."""
+        """Identify by the default method; return the results of the residuals one by one, and the default's last."""
         began = self.clock()
         limited = self._limited(run.part(0.0, 0.2), began)
         model = identify(self.rig, self.rig_text, self.training, prior=self.prior, run=limited)
@@ -176,21 +177,21 @@ class _Task:
         return [MethodResult(NOMINAL, before, fitted_before), own]
 
     def _limited(self, run: Run, began: float) -> Run:
-        """Return the run, stopped at the time limit."""
+        """Return the run with a stop at the time limit."""
         limit_s = self.time_limit_s
         return replace(run, should_stop=lambda: limit_s is not None and self.clock() - began > limit_s)
 
 
 def shared_rows(training: Observations, held_out: Observations, names: tuple[str, str]) -> tuple[int, tuple[str, ...]]:
-    """Look for held-out rows that are no test, because the training rows have them or their standstill.
+    """Find held-out rows that are not independent: rows that are training rows, or that share a standstill with them.
 
     Args:
         training: rows that are fitted.
-        held_out: rows that judge the fit.
-        names: what to call either of them.
+        held_out: rows that the fit is evaluated on.
+        names: names of the training and the held-out data for messages.
 
     Returns:
-        How many held-out rows are training rows as well, and a sentence on each of both kinds.
+        Number of held-out rows that are also training rows, and a sentence about each kind of row that was found.
     """
     joints = tuple(training.joints)
     readings = [_keys(o.setup, *(o.joints[name] for name in joints)) for o in (training, held_out)]
@@ -201,16 +202,16 @@ def shared_rows(training: Observations, held_out: Observations, names: tuple[str
     if same.any():
         found.append(
             f"{same.sum()} of the {len(held_out)} rows of {names[1]} are rows of {names[0]} as well, the first in "
-            f"{first_same}: the held-out figures are too good by these"
+            f"{first_same}; they make the held-out errors too small"
         )
     if pose.any():
         found.append(
             f"{pose.sum()} of the {len(held_out)} rows of {names[1]} were measured in poses of {names[0]}, all joints "
-            f"reading the same, the first in {first_pose}: they share the errors of those readings"
+            f"reading the same, the first in {first_pose}; they share the errors of those readings"
         )
     return int(same.sum()), tuple(found)
 
 
 def _keys(*columns: NDArray[np.str_] | Floats) -> NDArray[np.str_]:
-    """(n,) one text for each row; equal where all columns are."""
+    """Return (n,) one text for each row; the texts are equal where all columns are equal."""
     return np.array(["\x1f".join(map(repr, row)) for row in zip(*(c.tolist() for c in columns), strict=True)])

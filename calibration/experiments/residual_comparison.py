@@ -1,7 +1,7 @@
-"""Every residual on the same kinematics and effects: nothing, the field's and the paper's incumbents, our learners.
+"""Comparison of residuals on the same kinematics and effects: none, incumbents of industry and the paper, our learners.
 
-The incumbents are fitted as they are used, one for each prism and whether they help or not. Our learners are trained as
-`calibrate --residual` trains them, and left out where they do not help.
+The incumbents are fitted as in practice: one for each prism, whether it helps or not. Our learners are trained as by
+`calibrate --residual`, and left out if they do not help.
 """
 
 from __future__ import annotations
@@ -37,17 +37,17 @@ Labels = NDArray[np.str_]
 
 @dataclass(frozen=True)
 class MethodResult:
-    """Errors of one method; a method that refuses the data has a reason and no errors.
+    """Errors of one method; a method that does not apply to the data has a reason and no errors.
 
     Attributes:
-        method: `nominal`, a name of `calibrate`'s methods, or of `RESIDUALS` on the default's kinematics.
+        method: `nominal`, a method of `calibrate`, or one of `RESIDUALS` on the default kinematics.
         error_mm: (n,) size of the last stage's error on every held-out row.
         training_error_mm: the same on the training rows.
-        seconds: for the whole calibration with identification; None for the nominal model, which comes with any method.
-        adds: families of effects, then the residual's learner, that come on top of the kinematics.
+        seconds: duration of the whole calibration including identification; None for the nominal model.
+        adds: families of effects and then the residual's learner that the method adds to the kinematics.
         reason: why the method does not apply.
-        notes: about data and fit, of this method alone.
-        noise_mm: RMS 3-D error that station and encoders explain on the held-out rows, by this model.
+        notes: warnings about data and fit by this method only.
+        noise_mm: RMS 3-D error that station and encoders explain on the held-out rows, according to this model.
     """
 
     method: str
@@ -60,7 +60,7 @@ class MethodResult:
     noise_mm: float | None = None
 
     def as_dict(self) -> dict[str, object]:
-        """Return a JSON object: the figures in mm, None where the method does not apply."""
+        """Return a JSON object with the figures in mm, None if the method does not apply."""
         held, trained = self.error_mm, self.training_error_mm
         figures: dict[str, float | None] = dict.fromkeys(FIGURES)
         if held is not None and trained is not None:
@@ -92,20 +92,20 @@ def compare_residuals(
     clock: Callable[[], float],
     run: Run,
 ) -> list[MethodResult]:
-    """Train each on what the model leaves of the training rows, and look at the held-out ones.
+    """Train each residual on the model's errors on the training rows, and evaluate it on the held-out rows.
 
     Args:
-        model: identified on the training rows; its own residual is left aside.
+        model: model identified on the training rows; its own residual is ignored.
         training: rows to fit.
-        held_out: rows to judge by.
-        kinds: which of `RESIDUALS`.
-        refit_base: fit the base transform of the held-out set-ups, and nothing else, on the held-out rows first, for
-            each learner by itself.
-        clock: monotonic seconds.
+        held_out: rows to evaluate on.
+        kinds: residuals to compare, of `RESIDUALS`.
+        refit_base: first fit only the base transform of the held-out set-ups on the held-out rows, for each learner
+            separately.
+        clock: function that returns monotonic seconds.
         run: seed of the learners, workers and progress.
 
     Returns:
-        A result for each, with the seconds of its training alone.
+        A result for each kind; its `seconds` are those of the training alone.
     """
     bare = replace(model, residual=None)
     incumbents = _Incumbents(bare, training, held_out, refit_base=refit_base)
@@ -138,7 +138,7 @@ def _learner(
     trained = train_residual(model, training, kind=learner, run=run.quiet())
     notes: tuple[str, ...] = ()
     if trained.residual is None and learner != "none":
-        notes = (f"left out, its errors are those of the effects: {trained.residual_reason}",)
+        notes = (f"left out, so its errors are those of the effects: {trained.residual_reason}",)
     elsewhere = with_refitted_base(trained, held_out) if refit_base else trained
     return MethodResult(
         kind,
@@ -173,7 +173,7 @@ class _Incumbents:
         return MethodResult(TABLE, held_out, training, adds=(TABLE,))
 
     def paper_network(self, seed: int) -> MethodResult:
-        """Return the errors with the paper's network; those at the best width are in the notes."""
+        """Return the errors with the paper's network; the notes contain the error at the best width."""
         held_out, training = self._errors(lambda seen, left_mm, _: PaperRbfn.fit(seen, left_mm, seed=seed))
         thetas: dict[float, None] = {}
 
@@ -186,12 +186,12 @@ class _Incumbents:
         chosen = ", ".join(f"{theta:g}" for theta in sorted(thetas))
         note = (
             f"at the paper's width theta = {THETA:g} the mean held-out error is {held_out.mean():.3g} mm; at the best "
-            f"for each prism by cross-validation ({chosen}) it is {wider.mean():.3g} mm"
+            f"width of each prism by cross-validation ({chosen}) it is {wider.mean():.3g} mm"
         )
         return MethodResult(PAPER_NETWORK, held_out, training, adds=(PAPER_NETWORK,), notes=(note,))
 
     def _errors(self, fit: _Fit) -> tuple[Floats, Floats]:
-        """Sizes of the errors on held-out and on training rows, with an incumbent for each prism."""
+        """Return sizes of the errors on held-out and on training rows, with an incumbent for each prism."""
         fitted = {
             prism: fit(self._good.seen.select(rows), self._good.left_mm[rows], self._groups[rows])
             for prism, rows in self._good.prisms()
@@ -202,7 +202,7 @@ class _Incumbents:
         estimates, rows = self._held_out.estimates(fitted), self._rows
         if not self._refit_base:
             return sizes_mm(self._held_out.left_mm - estimates)
-        # As for our learners, a base is fitted to what the incumbents leave.
+        # As for our learners, the base is fitted to the errors that remain after the incumbents.
         rows = replace(rows, position_mm=rows.position_mm - Predictor.of(self._judged).to_station(rows, estimates))
         return sizes_mm(rows.position_mm - Predictor.of(with_refitted_base(self._model, rows)).effects_mm(rows))
 
@@ -222,11 +222,11 @@ class _Left:
         return cls(rows.prism, predictor.features(rows, ()), left_mm)
 
     def prisms(self) -> Iterator[tuple[str, NDArray[np.bool_]]]:
-        """Each prism with its rows."""
+        """Return each prism with the (n,) mask of its rows."""
         return ((prism, self.prism == prism) for prism in np.unique(self.prism).tolist())
 
     def estimates(self, fitted: Mapping[str, _Incumbent]) -> Floats:
-        """(n, 3) by each prism's incumbent; zero for a prism without one."""
+        """Return (n, 3) estimates by each prism's incumbent; zero for a prism without an incumbent."""
         estimates = np.zeros_like(self.left_mm)
         for prism, rows in self.prisms():
             if prism in fitted:

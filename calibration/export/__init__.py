@@ -1,1 +1,1 @@
-"""Export of models: formats, one a file in `formats`, and beside them what several formats share."""
+"""Export of models: the formats, one per file in `formats`, and the code that several formats share."""

@@ -1,7 +1,7 @@
-"""Effects as C: those that are a function of the joints' readings and of a few inputs of the caller.
+"""C code of the effects that are functions of the joint readings and of a few inputs of the caller.
 
-Loads are sums over the weights of each frame, so that what a fit found of uncertain weights comes out as a table of
-weights and first moments for every effect.
+Loads are sums over the weights of each frame. The fitted corrections of uncertain weights are therefore written as a
+table of weights and first moments for every effect.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ from calibration.kinematics.torques import MASS_SIGMA, STANDARD_GRAVITY
 from calibration.observations import Floats
 from calibration.rig.description import Rig
 
-_LATER = ("time_s", "row")  # variables of a regime that are beyond its border after the training
+_LATER = ("time_s", "row")  # variables of a regime that, after the training, are always above its border
 
 
 @dataclass
 class EffectCode:
-    """C of a model's effects.
+    """C code of a model's effects.
 
     Attributes:
-        tables: definitions.
+        tables: definitions of tables.
         lines: statements that add to `change` and to the shifts of `points`.
-        inputs: fields of the caller's inputs that they use.
-        needs_pose: True if they look at the machine's pose.
+        inputs: fields of the caller's inputs that the statements use.
+        needs_pose: True if the statements use the machine's pose.
     """
 
     tables: list[str] = field(default_factory=list)
@@ -46,18 +46,22 @@ class EffectCode:
 
 @dataclass(frozen=True)
 class EffectWriter:
-    """Writes the effects of one model.
+    """Writes the effects of one model as C code.
 
     Args:
-        context: any observations of the model's machine; the shapes of its uncertain loads are found with it.
-        tree: the motions of its machine.
+        context: any observations of the model's machine; they determine the shapes of its uncertain loads.
+        tree: the motions of the machine.
     """
 
     context: EffectContext
     tree: Carriers
 
     def code(self, effects: Mapping[int, FittedEffect]) -> EffectCode:
-        """Return the C of effects that `can_write`, each with its number."""
+        """Return the C code of effects.
+
+        Args:
+            effects: number of each effect -> the effect, which `can_write` accepts.
+        """
         out = EffectCode()
         for number, effect in effects.items():
             lines = list(self._lines(number, effect, out))
@@ -66,7 +70,7 @@ class EffectWriter:
         return out
 
     def can_write(self, effect: FittedEffect) -> bool:
-        """Return True for an effect that has a C form."""
+        """Return True if an effect can be written as C code."""
         known = effect.family in _WRITERS or isinstance(library()[effect.family], LinkFamily)
         regime = effect.regime
         columns = {joint.column for joint in self._rig.joints}
@@ -86,7 +90,7 @@ class EffectWriter:
             yield from _WRITERS[effect.family](self, number, effect, out)
 
     def _acts(self, number: int, effect: FittedEffect, out: EffectCode) -> str:
-        """Return the condition in which an effect acts; "" for always."""
+        """Return the C condition under which an effect acts; "" if it always acts."""
         regime = effect.regime
         if regime is None:
             return ""
@@ -120,7 +124,7 @@ class EffectWriter:
         yield f"change[{joint}] += {_c(effect.coefficients[0].value)} * {from_middle} * {from_middle};"
 
     def _constant(self, number: int, effect: FittedEffect, out: EffectCode) -> Iterator[str]:
-        """A step: after the training it has happened."""
+        """Write a step change, which has happened at any time after the training."""
         del number, out
         value = effect.coefficients[0].value * (math.degrees(1.0) if self._turns(effect) else 1.0)
         yield f"change[{self._joint(effect.where)}] += {_c(value)};"
@@ -285,7 +289,7 @@ class EffectWriter:
         return boom
 
     def _points(self) -> list[tuple[int, Floats]]:
-        """Return the frames and places of the points at which weight hangs, in the order of `GravityModel`."""
+        """Return frame and position of each point of weight, in the order of `GravityModel`."""
         found: list[tuple[int, Floats]] = []
         for mass in self._rig.masses:
             frames = (mass.frame,) if mass.centre_mm is not None else (mass.frame, mass.frame + 1)
@@ -299,17 +303,23 @@ class EffectWriter:
         return f"rigcal_load(at, {self._table(name, weights, out)}, {joint})"
 
     def _table(self, name: str, weights: Floats, out: EffectCode) -> str:
-        """Add a table of (frames, 4) weights, as (motions, 4) of what each motion carries in its own axes."""
+        """Add a table of weights and return its name.
+
+        Args:
+            name: its name without the prefix `rigcal_`.
+            weights: (frames, 4); the table has (motions, 4) weights that each motion carries, in its own axes.
+            out: the code to which the table is added.
+        """
         carried = np.zeros((len(self.tree.motions), 4))
         for (motion, place), (newton, *moment) in zip(self.tree.frames, weights, strict=True):
-            if motion >= 0:  # what is fixed to the base loads no joint
+            if motion >= 0:  # weights fixed to the base do not load a joint
                 carried[motion, 0] += newton
                 carried[motion, 1:] += place[:3, :3] @ moment + newton * place[:3, 3]
         out.tables.append(f"static const double rigcal_{name}[RIGCAL_MOTIONS][4] = {_list(carried)};")
         return f"rigcal_{name}"
 
     def _weights(self, mass: int | None = None) -> Floats:
-        """Return (frames, 4) weight in N and its moment about the frame's origin in N mm; of one mass, or of all."""
+        """Return (frames, 4) weight in N and its moment about the frame's origin in N mm, of one mass or of all."""
         rig = self._rig
         out = np.zeros((len(rig.rows) + 1, 4))
         for index, one in enumerate(rig.masses):
@@ -322,9 +332,9 @@ class EffectWriter:
         return out
 
     def _parts(self, row: int | None = None) -> Floats:
-        """Return (parts, frames, 4) changes of that by one sigma of each uncertain weight and centre.
+        """Return (parts, frames, 4) changes of the weights by one sigma of each uncertain weight and centre.
 
-        In the order of `GravityModel.parts`, or of `Link.parts_newton_m` for a row.
+        The order is that of `GravityModel.parts`, or of `Link.parts_newton_m` for a row.
         """
         rig, parts = self._rig, []
         beyond = [row is None or row in rig.path(frame) for frame in range(len(rig.rows) + 1)]
@@ -339,7 +349,7 @@ class EffectWriter:
         return np.array(parts).reshape(-1, len(beyond), 4)
 
     def _shaped(self, shapes: LoadShapes, parts: Floats) -> Floats:
-        """Return (r, frames, 4) weights that make the change of a load by each of its shapes."""
+        """Return (r, frames, 4) weights that produce the change of a load by each of its r shapes."""
         left = parts - shapes.share[:, None, None] * self._weights()
         return np.tensordot(shapes.mixing.T, left, axes=1)
 
@@ -364,7 +374,7 @@ _WRITERS: Mapping[str, _Writer] = {
 
 
 def _c(value: float) -> str:
-    """Return a number as C reads it back exactly."""
+    """Return a number as a C literal that reads back exactly, in parentheses if negative."""
     text = repr(float(value))
     return f"({text})" if text.startswith("-") else text
 

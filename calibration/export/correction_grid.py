@@ -1,4 +1,4 @@
-"""A grid of corrections: at nodes of joint values, where each prism is by the drawings and by the model.
+"""A grid of corrections: the nominal and the corrected position of each prism at nodes of joint values.
 
 Between nodes the difference is interpolated linearly in every joint value.
 """
@@ -30,11 +30,11 @@ T = TypeVar("T", bound=np.generic)
 _CURVATURE_POSES = 256
 _CURVATURE_STEP = 0.05  # of a joint's range
 _PROOF_POSES = 500
-_LEAST_RANGE = 1.0  # deg or mm, of a joint that stood still in training
+_LEAST_RANGE = 1.0  # deg or mm; range of the grid for a joint that did not move in training
 _CHUNK = 10_000
-FINE_SHARE = 0.1  # of the corrections: what interpolation may leave of them
-_FIRST_POSES, _FINER = 64, 2  # nodes that are tried first, and by what factor there are more then
-_LATER_S = 1e12  # `time_s` of the grid, after any training: what has jumped then has jumped
+FINE_SHARE = 0.1  # of the corrections: tolerated interpolation error
+_FIRST_POSES, _FINER = 64, 2  # nodes of the first grid, and the factor by which each next grid is larger
+_LATER_S = 1e12  # `time_s` of the grid, after any training, so that all step changes have happened
 
 
 @dataclass(frozen=True)
@@ -42,14 +42,13 @@ class CorrectionGrid:
     """Corrections at the nodes of a grid of joint values, in the base frame.
 
     Attributes:
-        nodes: joint -> its values on the grid, rising, deg or mm.
-        readings: (g, joints) all combinations, the last joint changing fastest.
-        nominal_mm, corrected_mm: prism -> (g, 3) by the drawings, and by the model.
+        nodes: joint -> its values on the grid, ascending, deg or mm.
+        readings: (g, joints) all combinations, with the last joint changing fastest.
+        nominal_mm, corrected_mm: prism -> (g, 3) nominal position, and position of the model.
         reachable: (g,) True where the rig touches neither itself nor the floor.
-        lacking: the effects of the machine that need more than joint values, so that the grid has them not.
-        rms_mm, p95_mm, max_mm: how far the interpolated corrections are from the model's own, in random poses on the
-            grid, all prisms taken together.
-        correction_rms_mm: how large the model's own corrections are there.
+        lacking: effects of the machine that the grid leaves out because they need more than joint values.
+        rms_mm, p95_mm, max_mm: error of the interpolated corrections at random poses, all prisms together.
+        correction_rms_mm: RMS size of the model's own corrections at these poses.
     """
 
     nodes: Mapping[str, Floats]
@@ -65,7 +64,7 @@ class CorrectionGrid:
 
     @property
     def is_coarse(self) -> bool:
-        """True if interpolating leaves more than a tenth of the error that the grid is there to take away."""
+        """True if the interpolation error is more than a tenth of the corrections."""
         return self.rms_mm > FINE_SHARE * self.correction_rms_mm
 
 
@@ -73,30 +72,32 @@ class CorrectionGrid:
 def correction_grid(
     model: CalibratedModel, prisms: Sequence[str], most_poses: int, rng: np.random.Generator
 ) -> CorrectionGrid:
-    """Compute corrections over the joint values that the model was trained on, with more nodes where they bend more.
+    """Compute corrections over the trained joint values, with more nodes along joints with more curvature.
 
-    Elsewhere a model says what its kinematics say, and a grid that reached there would be coarser everywhere. There are
-    as many nodes as bring the error of interpolation under a tenth of the corrections, if `most_poses` allow it.
+    Outside the trained range a model predicts by its kinematics only, and a grid that extended there would be coarser
+    everywhere. The number of nodes is increased until the interpolation error is below a tenth of the
+    corrections, or until `most_poses`.
 
     Args:
-        model: the model. Effects and residual are taken as for data that have joint values and nothing else, measured
+        model: the model. Its effects and residual are evaluated for data that have only joint values and were measured
             after the training.
-        prisms: of its rig, at least one.
-        most_poses: the grid has no more nodes.
-        rng: draws the poses by which nodes are placed and the interpolation is judged.
+        prisms: prisms of its rig, at least one.
+        most_poses: greatest number of nodes.
+        rng: draws the poses that determine the nodes and the interpolation error.
 
     Raises:
-        DataError: a prism that the rig lacks, too few nodes for two at each joint, or a joint that was trained beyond
-            its limits alone.
+        DataError: a prism that the rig lacks, too few nodes for two at each joint, or a joint that was trained only
+            beyond its limits.
     """
     unknown = sorted(set(prisms) - set(model.rig.prism_names))
     if unknown:
-        raise DataError("grid", f"rig {model.rig.name!r} has no prism {unknown[0]!r}; it has {model.rig.prism_names}")
+        allowed = ", ".join(model.rig.prism_names)
+        raise DataError("grid", f"rig {model.rig.name!r} has no prism {unknown[0]!r}; it has {allowed}")
     joints = model.rig.joints
     least = 2 ** len(joints)
     if most_poses < least:
-        reason = f"two values for each of {len(joints)} joints make {least:,} poses, and {most_poses:,} are allowed"
-        raise DataError("grid", f"{reason}; allow more, or export other formats, such as json or c-header")
+        reason = f"two values for each of {len(joints)} joints make {least:,} poses, but {most_poses:,} are allowed"
+        raise DataError("grid", f"{reason}; allow more, or export another format, such as json or c-header")
     machine = Machine(model, setup_of(model))
     low, high = trained_ranges(model)
     bends_mm = _curvature_mm(machine, prisms, low, high, rng)
@@ -131,10 +132,10 @@ def correction_grid(
 
 
 def trained_ranges(model: CalibratedModel) -> tuple[Floats, Floats]:
-    """Return (joints,) least and greatest values of the joints in training, inside their limits, deg or mm.
+    """Return (joints,) least and greatest trained values of the joints, inside their limits, deg or mm.
 
     Raises:
-        DataError: a joint that was trained beyond its limits alone.
+        DataError: a joint that was trained only beyond its limits.
     """
     low, high = np.array([_range(model, joint) for joint in model.rig.joints]).T
     return low, high
@@ -144,12 +145,12 @@ def interpolated(nodes: Mapping[str, Floats], values: Floats, readings: Floats) 
     """Interpolate values at the nodes of a grid linearly in every joint.
 
     Args:
-        nodes: joint -> its values on the grid, rising.
-        values: (g, 3) at all combinations, the last joint changing fastest.
-        readings: (n, joints) inside the grid.
+        nodes: joint -> its values on the grid, ascending.
+        values: (g, 3) values at all combinations, with the last joint changing fastest.
+        readings: (n, joints) joint values inside the grid.
 
     Returns:
-        (n, 3).
+        (n, 3) interpolated values.
     """
     shape = tuple(len(own) for own in nodes.values())
     table = RegularGridInterpolator(tuple(nodes.values()), values.reshape(*shape, 3))
@@ -157,7 +158,7 @@ def interpolated(nodes: Mapping[str, Floats], values: Floats, readings: Floats) 
 
 
 def _range(model: CalibratedModel, joint: Joint) -> tuple[float, float]:
-    """Least and greatest value of a joint on the grid: as in training, inside its limits, and some way apart."""
+    """Return the least and greatest value of a joint on the grid: as in training, but inside the limits and apart."""
     trained_low, trained_high = model.coverage.ranges[joint.name]
     spare = max(0.0, 0.5 * (_LEAST_RANGE - (trained_high - trained_low)))
     low, high = max(trained_low - spare, joint.limits[0]), min(trained_high + spare, joint.limits[1])
@@ -165,21 +166,26 @@ def _range(model: CalibratedModel, joint: Joint) -> tuple[float, float]:
         raise DataError(
             "grid",
             f"{joint.name} was trained at {trained_low:.1f} .. {trained_high:.1f} {joint.unit}, beyond its limits "
-            f"{joint.limits[0]:g} .. {joint.limits[1]:g}: no command inside them was measured; correct limits or zero "
-            f"in the rig file and calibrate again",
+            f"{joint.limits[0]:g} .. {joint.limits[1]:g}, and no value inside them was measured; correct the limits or "
+            f"the zero in the rig file and calibrate again",
         )
     return low, high
 
 
 @dataclass(frozen=True)
 class Machine:
-    """Places of prisms in the base frame at joint values (n, joints), by the drawings and by the model."""
+    """Positions of prisms in the base frame at joint values (n, joints): nominal, and of the model.
+
+    Attributes:
+        model: the model.
+        setup: index of the set-up whose base is used.
+    """
 
     model: CalibratedModel
     setup: int
 
     def nominal_mm(self, prism: str, readings: Floats) -> Floats:
-        """(n, 3) by the drawings."""
+        """Return (n, 3) nominal positions, mm."""
         model = self.model
         base = model.chain.base(model.nominal_values, self.setup)
         nominal_mm = Predictor.of(model).nominal_mm(self.rows(prism, readings))
@@ -187,19 +193,19 @@ class Machine:
         return turned
 
     def corrected_mm(self, prism: str, readings: Floats, extra: Mapping[str, Floats] | None = None) -> Floats:
-        """(n, 3) by the model; `extra` are further columns of the observations."""
+        """Return (n, 3) positions of the model, mm; `extra` are further columns of the observations."""
         if extra is not None:
             rows = self.rows(prism, readings)
             return Predictor.of(self.model).base_mm(replace(rows, extra={**rows.extra, **extra}))
         return _in_chunks(lambda some: Predictor.of(self.model).base_mm(self.rows(prism, some)), readings)
 
     def correction_mm(self, prism: str, readings: Floats) -> Floats:
-        """(n, 3) the difference."""
+        """Return (n, 3) the model's positions minus the nominal ones, mm."""
         difference: Floats = self.corrected_mm(prism, readings) - self.nominal_mm(prism, readings)
         return difference
 
     def reachable(self, readings: Floats) -> Flags:
-        """(n,) True where the rig touches neither itself nor the floor."""
+        """Return an (n,) mask, True where the rig touches neither itself nor the floor."""
         chain, values = self.model.chain, self.model.values
         at = site(chain, values, setup=self.setup)
         return _in_chunks(lambda some: is_reachable(Bodies.of(chain, values, some), at), readings)
@@ -210,12 +216,12 @@ class Machine:
         return tuple(effect for effect in self.model.effects if library()[effect.family].moves_machine)
 
     def lacking(self, rows: Observations) -> tuple[FittedEffect, ...]:
-        """Return the effects that move the machine and lack an input in some of these rows."""
+        """Return the effects that move the machine and that lack an input in some of these rows."""
         context = Predictor.of(self.model).context(rows)
         return tuple(effect for effect in self.effects if left_out([effect], context))
 
     def rows(self, prism: str, readings: Floats) -> Observations:
-        """Return observations of a prism at these joint values, not measured yet."""
+        """Return observations of a prism at these joint values, without positions."""
         n = len(readings)
         return Observations(
             prism=np.full(n, prism),
@@ -236,9 +242,9 @@ def _in_chunks(function: Callable[[Floats], NDArray[T]], readings: Floats) -> ND
 def _curvature_mm(
     machine: Machine, prisms: Sequence[str], low: Floats, high: Floats, rng: np.random.Generator
 ) -> Floats:
-    """(joints,) RMS error of interpolating the corrections linearly between the ends of each joint's range, mm.
+    """Return (joints,) RMS error, mm, of linear interpolation of the corrections over each joint's whole range.
 
-    Of a parabola as bent as the corrections are on the average: it is range^2 |f''| / sqrt(120).
+    It is the error for a parabola with the average curvature of the corrections: range^2 |f''| / sqrt(120).
     """
     span = high - low
     middle = rng.uniform(low + _CURVATURE_STEP * span, high - _CURVATURE_STEP * span, (_CURVATURE_POSES, len(span)))
@@ -257,9 +263,10 @@ def _curvature_mm(
 
 
 def _counts(error_mm: Floats, most: int) -> list[int]:
-    """Number of nodes of each joint: one more, again and again, where it lowers the squared error most for its price.
+    """Return the number of nodes of each joint, found by adding nodes one by one.
 
-    The error of n nodes is that of two over (n - 1)^2; the price is the factor by which the grid grows.
+    Each node is added where it reduces the squared error most relative to its cost. The error of n nodes is that of two
+    nodes divided by (n - 1)^2; the cost is the logarithm of the factor by which the grid grows.
     """
     counts = [2] * len(error_mm)
     while True:

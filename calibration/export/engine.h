@@ -1,10 +1,10 @@
 /* ---- the program: the same for every rig ------------------------------------------------------------------------ */
 
-/* Axes as columns; origin, mm; the motion's own size, rad or mm, and for a turn its cosine and sine. */
+/* Axes as columns; origin, mm; the motion's own size, rad or mm, and for a rotation its cosine and sine. */
 typedef struct { double r[3][3]; double t[3]; double size, c, s; } rigcal_frame_t;
 
-/* Cosine and sine of a turn. Beside a turn that is known they come from the difference by their series, whose first term
-   that is left out is below 1e-20 there. */
+/* Cosine and sine of a rotation. Close to a known rotation they are computed from the difference by series, whose first
+   omitted term is then below 1e-20. */
 static inline void rigcal_turn(double size, const rigcal_frame_t *known, rigcal_frame_t *out)
 {
     const double d = known ? size - known->size : 1.0, dd = d * d;
@@ -20,7 +20,7 @@ static inline void rigcal_turn(double size, const rigcal_frame_t *known, rigcal_
     out->s = known->s + (known->c * s - known->s * v);
 }
 
-/* Places of all motions at joint values q, deg and mm; `known` may be those at values close by, or NULL. */
+/* Frames of all motions at joint values q, deg and mm; `known` may be the frames at close joint values, or NULL. */
 static inline void rigcal_pose(const double q[RIGCAL_JOINTS], const rigcal_frame_t *known,
                                rigcal_frame_t at[RIGCAL_MOTIONS])
 {
@@ -57,7 +57,7 @@ static inline void rigcal_pose(const double q[RIGCAL_JOINTS], const rigcal_frame
     }
 }
 
-/* Place of a point that a motion carries, -1 for the base, mm. */
+/* Position, mm, of a point fixed to a motion; motion -1 is the base. */
 static inline void rigcal_place(const rigcal_frame_t at[], int motion, const double point[3], double out[3])
 {
     const int k = motion;
@@ -71,7 +71,7 @@ static inline int rigcal_carries(int motion, int prism)
     return rigcal_prism_motion[prism] >= 0 && rigcal_beyond[motion][rigcal_prism_motion[prism]];
 }
 
-/* Derivative of a point's place by the size of a motion, mm per rad or mm. */
+/* Derivative of a point's position with respect to the size of a motion, mm per rad or mm. */
 static inline void rigcal_slope(const rigcal_frame_t *at, int kind, int axis, const double point[3], double out[3])
 {
     const double a[3] = {at->r[0][axis], at->r[1][axis], at->r[2][axis]};
@@ -85,7 +85,8 @@ static inline void rigcal_slope(const rigcal_frame_t *at, int kind, int axis, co
     out[2] = a[0] * w[1] - a[1] * w[0];
 }
 
-/* Weight of a table beyond a motion, -1 for all (N), and its moment about a point (N mm); a table has N and N mm by motion. */
+/* Weight (N) that a motion carries, or all weight for motion -1, and its moment about a point (N mm). The table has the
+   weight (N) and moment (N mm) of each motion. */
 static inline void rigcal_hang(const rigcal_frame_t at[], const double table[RIGCAL_MOTIONS][4], int motion,
                                const double about[3], double sum[4])
 {
@@ -101,7 +102,7 @@ static inline void rigcal_hang(const rigcal_frame_t at[], const double table[RIG
     }
 }
 
-/* Moment about a motion's origin of the weights beyond it, N m. */
+/* Moment, N m, of the weights that a motion carries about its origin. */
 static inline void rigcal_moment(const double sum[4], double out[3])
 {
     const double *g = rigcal_down;
@@ -110,7 +111,7 @@ static inline void rigcal_moment(const double sum[4], double out[3])
     out[2] = (sum[1] * g[1] - sum[2] * g[0]) / 1e3;
 }
 
-/* Gravity's load on a joint, N m or N; positive drives its value up. */
+/* Load of gravity on a joint, N m or N; a positive load increases the joint's value. */
 static inline double rigcal_load(const rigcal_frame_t at[], const double table[RIGCAL_MOTIONS][4], int joint)
 {
     double load = 0.0;
@@ -132,15 +133,15 @@ static inline double rigcal_load(const rigcal_frame_t at[], const double table[R
     return load * rigcal_load_unit[joint];
 }
 
-/* Prisms that are asked for: their numbers, places at the readings and shifts by effects, mm. */
+/* The requested prisms: their numbers, positions at the readings and shifts by effects, mm. */
 typedef struct {
     int count;
     const int *prism;
     double place[RIGCAL_PRISMS][3], shift[RIGCAL_PRISMS][3];
 } rigcal_points_t;
 
-/* A link that turns about its joint's place in proportion to a moment: the shift of the prisms, mm.
-   `along` is 1 for the part of the moment along the axis, 0 for that across it. */
+/* A link that rotates about its joint in proportion to a moment: adds the shift of the prisms, mm.
+   `along` is 1 for the component of the moment along the axis, 0 for the component across it. */
 static inline void rigcal_bend(const rigcal_frame_t at[], const double table[RIGCAL_MOTIONS][4], int motion, int along,
                                double amount, rigcal_points_t *points)
 {
@@ -163,8 +164,8 @@ static inline void rigcal_bend(const rigcal_frame_t at[], const double table[RIG
     }
 }
 
-/* A boom from the origin of one frame to that of another: its length, mm, its axis, and how a point at `arm` from a
-   place on it moves as it turns down about its level axis, per rad times the cosine of its elevation. */
+/* A boom from the origin of frame `root` to the origin of frame `tip`: returns its length, mm; also gives its two ends
+   and its axis. */
 static inline double rigcal_boom(const rigcal_frame_t at[], int root, int tip, double from[3], double to[3],
                                  double axis[3])
 {
@@ -189,8 +190,8 @@ static inline void rigcal_cross(const double a[3], const double b[3], double out
     out[2] = a[0] * b[1] - a[1] * b[0];
 }
 
-/* A beam that bends: `tip_newton` at its tip with the moment of a table's weights about it, `own_newton` along it, in
-   units of its flexibility. */
+/* A beam that bends under a force `tip_newton` and the moment of a table's weights at its tip, and a force `own_newton`
+   distributed along it, in units of its flexibility. */
 static inline void rigcal_droop(const rigcal_frame_t at[], int root, int tip, const double table[RIGCAL_MOTIONS][4],
                                 double tip_newton, double own_newton, rigcal_points_t *points)
 {
@@ -217,7 +218,7 @@ static inline void rigcal_droop(const rigcal_frame_t at[], int root, int tip, co
     }
 }
 
-/* The inner section of a boom tilts about the mouth of the outer one until its pads touch. */
+/* The inner section of a boom tilts about the mouth of the outer section until its pads touch. */
 static inline void rigcal_pads(const rigcal_frame_t at[], int root, int tip, const double table[RIGCAL_MOTIONS][4],
                                double outer_mm, double overlap_mm, double clearance_mm,
                                rigcal_points_t *points)
@@ -240,7 +241,7 @@ static inline void rigcal_pads(const rigcal_frame_t at[], int root, int tip, con
     }
 }
 
-/* The term of one drive alone, `amount` further of its joint, deg or mm: the shift of the prisms, mm. */
+/* One drive moves as if its joint read `amount` more, deg or mm: adds the shift of the prisms, mm. */
 static inline void rigcal_follow(const rigcal_frame_t at[], int motion, int drive, double amount,
                                  rigcal_points_t *points)
 {
@@ -259,7 +260,7 @@ static inline double rigcal_triangle(double s, double left, double middle, doubl
            / (6.0 * (right - left));
 }
 
-/* Cubic splines whose slope changes about inner knots, less a straight line each, times their weights. */
+/* Weighted sum of cubic splines whose slope changes around inner knots, each minus a straight line. */
 static inline double rigcal_curve(double s, int count, const double knots[], const double line[2][16],
                                   const double weight[], int symmetric)
 {
@@ -272,7 +273,7 @@ static inline double rigcal_curve(double s, int count, const double knots[], con
     return out;
 }
 
-/* Even cubic B-splines over a range or a turn. */
+/* Uniform cubic B-splines over a range or a full turn. */
 static inline double rigcal_splines(double deg, double low, double high, int pieces, int is_turn, int count,
                                     const double weight[])
 {
@@ -291,8 +292,8 @@ static inline double rigcal_sign(double x) { return (x > 0.0) - (x < 0.0); }
 
 /* ---- effects of this model -------------------------------------------------------------------------------------- */
 
-/* What the effects add to the joints' readings and to the prisms' places. Returns 1 where they look at the pose of the
-   readings, which is then in `at`. */
+/* Compute the changes by effects of the joint readings and of the prisms' positions. Returns 1 if an effect uses the
+   pose at the readings, which is then in `at`. */
 static inline int rigcal_effects(const double q[RIGCAL_JOINTS], const rigcal_inputs *in,
                                  rigcal_frame_t at[RIGCAL_MOTIONS], double change[RIGCAL_JOINTS],
                                  rigcal_points_t *points)
@@ -324,8 +325,8 @@ static inline void rigcal_solve_pose(const double q[RIGCAL_JOINTS], const rigcal
 
 #define RIGCAL_CLOSE_MM 1e-9
 
-/* Steps of Gauss and Newton from q, that of least change of the joints in units of `range`. Returns their number, or -1;
-   q and off_mm are then the nearest place that it came to. */
+/* Gauss-Newton steps from q, each with the least change of the joints in units of `range`. Returns the number of steps,
+   or -1 on failure; q and off_mm are then the best joint values and their remaining distance. */
 static inline int rigcal_approach(int count, const int prism[], const double *target_mm, const rigcal_inputs *in,
                                   const double range[RIGCAL_JOINTS], double q[RIGCAL_JOINTS], double *off_mm)
 {
@@ -348,7 +349,7 @@ static inline int rigcal_approach(int count, const int prism[], const double *ta
             }
         off = sqrt(off);
         if (off < best) {
-            const int is_fast = step > 1 && off < 0.01 * best;   /* then the slopes of the step before do */
+            const int is_fast = step > 1 && off < 0.01 * best;   /* then the slopes of the previous step suffice */
             idle = off < 0.5 * best ? 0 : idle + 1;
             best = off;
             damping *= 0.1;
@@ -375,8 +376,8 @@ static inline int rigcal_approach(int count, const int prism[], const double *ta
             idle++;
         }
         if (idle > 40) break;
-        /* Least change of the joints, in ranges, that closes the error: dq = J' (J J' + damping)^-1 error; joints at a
-           limit that it would cross are held. */
+        /* Least change of the joints, in units of their ranges, that removes the error:
+           dq = J' (J J' + damping)^-1 error. Joints at a limit that the step would cross are held. */
         for (int round = 0; round <= RIGCAL_JOINTS; round++) {
             double a[MOST][MOST + 1], most = 0.0;
             int crossed = 0;
@@ -430,9 +431,9 @@ static inline int rigcal_approach(int count, const int prism[], const double *ta
     return -1;
 }
 
-/* ---- what to call ----------------------------------------------------------------------------------------------- */
+/* ---- public functions ------------------------------------------------------------------------------------------- */
 
-/* Places of all prisms in the base frame, mm, at joint readings q, deg and mm. `in` may be NULL: nothing is known. */
+/* Positions of all prisms in the base frame, mm, at joint readings q, deg and mm. `in` may be NULL: no input known. */
 static inline void rigcal_forward(const double q[RIGCAL_JOINTS], const rigcal_inputs *in,
                                   double out_mm[RIGCAL_PRISMS][3])
 {
@@ -442,10 +443,10 @@ static inline void rigcal_forward(const double q[RIGCAL_JOINTS], const rigcal_in
     rigcal_solve_pose(q, in, RIGCAL_PRISMS, prism, at, out_mm);
 }
 
-/* The joint commands that bring `count` prisms to their targets (x, y, z of each, base frame, mm), near to those in q
-   on entry and inside the joints' limits. Returns the number of steps taken, or -1 where a target stays farther than
-   RIGCAL_CLOSE_MM; q is then as near as it came. Where play leaves a gap on the shortest way, one joint after the other
-   is held back, so that the others go round it. */
+/* Compute the joint commands that bring `count` prisms to their targets (x, y, z of each, base frame, mm), near the
+   commands in q on entry and inside the joints' limits. Returns the number of steps, or -1 if a target remains farther
+   away than RIGCAL_CLOSE_MM; q is then the best solution found. Play can leave a gap on the shortest path; the solver
+   then holds back one joint after the other, so that the other joints go around the gap. */
 static inline int rigcal_inverse(int count, const int prism[], const double *target_mm, const rigcal_inputs *in,
                                  double q[RIGCAL_JOINTS])
 {

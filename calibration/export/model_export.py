@@ -1,4 +1,4 @@
-"""A model to be exported: what formats share, and the error of what each of them leaves out."""
+"""The code that export formats share, and the error due to the parts of the model that a format leaves out."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ _SEED = 0
 
 @dataclass(frozen=True)
 class LeftOut:
-    """The parts of its model that an export lacks, and what that costs.
+    """The parts of the model that an export leaves out, and the resulting error.
 
     Attributes:
-        parts: phrases, such as `joint_compliance@q2`; none where it lacks nothing.
-        not_measured: phrases on parts whose error is none of the joint values' alone.
-        rms_mm, p95_mm, max_mm: by what the export is wrong for that, over the work volume, all prisms together.
-        correction_rms_mm: how large the model's whole correction of the drawings is there.
+        parts: phrases, such as `joint_compliance@q2`; empty if nothing is left out.
+        not_measured: sentences about parts whose error does not depend on joint values alone.
+        rms_mm, p95_mm, max_mm: resulting error of the export over the work volume, all prisms together.
+        correction_rms_mm: RMS size of the model's whole correction of the nominal positions there.
     """
 
     parts: tuple[str, ...]
@@ -42,13 +42,13 @@ class LeftOut:
 
     @classmethod
     def of(cls, parts: Sequence[str], told: Sequence[str], off_mm: Floats, correction_mm: Floats) -> LeftOut:
-        """Return what is left out by its errors.
+        """Return the parts left out with their errors.
 
         Args:
-            parts: as `parts`.
-            told: as `not_measured`.
-            off_mm: (n, 3) how far the export is from the model in poses of the work volume.
-            correction_mm: (n, 3) how far the model is from the drawings there.
+            parts: the attribute `parts`.
+            told: the attribute `not_measured`.
+            off_mm: (n, 3) difference between export and model at poses of the work volume.
+            correction_mm: (n, 3) difference between model and nominal positions at the same poses.
         """
         size_mm = np.linalg.norm(off_mm, axis=1)
         return cls(
@@ -62,19 +62,19 @@ class LeftOut:
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """Sentences for the file and for people."""
+        """Sentences for the file and the terminal."""
         return tuple(self._sentences())
 
     def _sentences(self) -> Iterator[str]:
         if not self.parts:
-            yield "It leaves nothing of the model out that depends on the joints alone."
+            yield "It leaves out no part of the model that depends on the joint values alone."
         elif self.max_mm == 0.0:
-            yield f"It leaves out {', '.join(self.parts)}, which at joint values alone do nothing."
+            yield f"It leaves out {', '.join(self.parts)}, which have no influence at joint values alone."
         else:
             yield (
-                f"It leaves out {', '.join(self.parts)}. For that its positions are wrong by {self.rms_mm:.3g} mm RMS "
-                f"over the work volume (95 % within {self.p95_mm:.3g} mm, {self.max_mm:.3g} mm at most), of a "
-                f"correction of {self.correction_rms_mm:.3g} mm RMS."
+                f"It leaves out {', '.join(self.parts)}. Its positions therefore have an error of {self.rms_mm:.3g} mm "
+                f"RMS over the work volume (95 % within {self.p95_mm:.3g} mm, {self.max_mm:.3g} mm at most), compared "
+                f"with a correction of {self.correction_rms_mm:.3g} mm RMS."
             )
         yield from self.not_measured
 
@@ -92,12 +92,12 @@ class LeftOut:
 
 @dataclass(frozen=True)
 class Export:
-    """A model and what is asked of its export.
+    """A model and the options of its export.
 
     Attributes:
         model: the model.
-        manifest_sha256: SHA-256 of the model's manifest, which names it.
-        prisms: prisms of the grid; all of the rig when empty.
+        manifest_sha256: SHA-256 of the model's manifest, which identifies the model.
+        prisms: prisms of the grid; all prisms of the rig if empty.
         most_poses: greatest number of nodes of the grid.
     """
 
@@ -111,14 +111,14 @@ class Export:
         """The correction grid, computed once.
 
         Raises:
-            DataError: as `correction_grid`.
+            DataError: as for `correction_grid`.
         """
         prisms = self.prisms or self.model.rig.prism_names
         return correction_grid(self.model, prisms, self.most_poses, np.random.default_rng(_SEED))
 
     @cached_property
     def summary(self) -> Mapping[str, Any]:
-        """Size of the grid, its interpolation errors in mm, and `warnings`, sentences."""
+        """Size of the grid, its interpolation errors in mm, and `warnings` as sentences."""
         grid = self.grid
         return {
             "rows": len(grid.readings) * len(grid.nominal_mm),
@@ -133,29 +133,29 @@ class Export:
 
     @cached_property
     def setup(self) -> int:
-        """Index of the set-up whose base is known best; gravity is taken from there."""
+        """Index of the set-up whose base is known best; its direction of gravity is used."""
         return setup_of(self.model)
 
     def heading(self, left_out: LeftOut) -> tuple[str, ...]:
-        """Return the lines at the head of an export that is text."""
+        """Return the lines at the head of a text export."""
         model = self.model
         return (
             f"Made by `rigcal model export` from the model of rig {model.rig.name} with manifest SHA-256 "
             f"{self.manifest_sha256 or 'unknown'}.",
-            "Its base frame is the rig file's; where the base stands at a station set-up is not in it.",
+            "Its base frame is that of the rig file; it does not contain the position of the base at a station set-up.",
             *left_out.sentences,
         )
 
     @cached_property
     def kinematics_alone(self) -> LeftOut:
-        """Return what a format leaves out that has the identified kinematics and nothing else."""
+        """What a format leaves out that contains only the identified kinematics."""
         return self.without(lambda _: False)
 
     def without(self, keeps: Callable[[FittedEffect], bool]) -> LeftOut:
-        """Measure what leaving out the residual, and effects that are not kept, costs over the work volume.
+        """Measure the error over the work volume of leaving out the residual and all effects that are not kept.
 
         Args:
-            keeps: True for an effect that stays.
+            keeps: True for an effect that the export contains.
         """
         model = self.model
         whole = Machine(model, self.setup)
@@ -176,7 +176,7 @@ class Export:
 
     @cached_property
     def left_out_of_grid(self) -> LeftOut:
-        """Return what the grid lacks: what bends between its nodes, and effects that need more than joint values."""
+        """What the grid leaves out: curvature between its nodes, and effects that need more than joint values."""
         grid, machine = self.grid, Machine(self.model, self.setup)
         poses, extra = self.trial_poses()
         off, correction = [], []
@@ -184,13 +184,13 @@ class Export:
             correction_mm = machine.corrected_mm(prism, poses, extra) - machine.nominal_mm(prism, poses)
             correction.append(correction_mm)
             off.append(interpolated(grid.nodes, grid.corrected_mm[prism] - nominal_mm, poses) - correction_mm)
-        parts = [f"what lies between the nodes of {len(grid.readings)} poses", *map(str, grid.lacking)]
+        parts = [f"curvature between the nodes of {len(grid.readings)} poses", *map(str, grid.lacking)]
         return LeftOut.of(parts, self.not_measured(grid.lacking), np.concatenate(off), np.concatenate(correction))
 
     def trial_poses(self) -> tuple[Floats, dict[str, Floats]]:
-        """Draw poses of the work volume: (n, joints) joint values, and further columns of the observations there.
+        """Draw poses of the work volume: (n, joints) joint values, and further columns of their observations.
 
-        Each joint comes from one side or the other.
+        The columns give each joint a random direction of its last motion.
         """
         low, high = trained_ranges(self.model)
         rng = np.random.default_rng(_SEED)
@@ -198,24 +198,29 @@ class Export:
         return poses, {f"{name}_dir": rng.choice([-1.0, 1.0], _POSES) for name in self.model.rig.joint_names}
 
     def not_measured(self, lost: Sequence[FittedEffect]) -> tuple[str, ...]:
-        """Return sentences on the effects whose cost trial poses do not show.
+        """Return sentences about the effects whose error the trial poses do not show.
 
         Args:
             lost: effects that move the machine and are left out.
         """
         of_machine = Machine(self.model, self.setup).effects
         told = [
-            f"{effect} moves fixes or the base and is no part of any export."
+            f"{effect} moves fixes or the base and is not part of any export."
             for effect in self.model.effects
             if effect not in of_machine
         ]
         lacking = [effect for effect in lost if (need := _needs(effect)) and not need.endswith("_dir")]
-        told += [f"What {effect} does is not measured here: it needs {_needs(effect)}." for effect in lacking]
+        told += [f"The error without {effect} is not measured here: it needs {_needs(effect)}." for effect in lacking]
         return tuple(told)
 
 
 def without_parts(model: CalibratedModel, effects: Sequence[FittedEffect]) -> CalibratedModel:
-    """Return a model with some of its effects and without a residual."""
+    """Return a model with only the given effects and without a residual.
+
+    Args:
+        model: the model.
+        effects: the effects to keep.
+    """
     kept = [np.arange(len(model.values))]
     first = len(model.values)
     for effect in model.effects:
@@ -230,15 +235,15 @@ def without_parts(model: CalibratedModel, effects: Sequence[FittedEffect]) -> Ca
 
 @dataclass(frozen=True)
 class Format:
-    """One format.
+    """One export format.
 
     Attributes:
-        name: as `--format` has it.
+        name: value of `--format`.
         file: name of the file that it writes.
-        about: what the file is, a phrase for the command's help.
-        content: makes its content.
-        left_out: says what it lacks of the model, and what that costs.
-        is_default: True if it is written when no format is asked for.
+        about: description of the file, a phrase for the command's help.
+        content: makes the content of the file.
+        left_out: returns the parts of the model that the format leaves out, and the resulting error.
+        is_default: True if it is written when no format is requested.
     """
 
     name: str
@@ -250,13 +255,13 @@ class Format:
 
 
 def kinematics_format(name: str, file: str, about: str, text: Callable[[Chain, Floats, Sequence[str]], str]) -> Format:
-    """Return a format that has the identified kinematics as text, and nothing else of the model.
+    """Return a text format that contains only the identified kinematics of the model.
 
     Args:
-        name: as of `Format`.
-        file: as of `Format`.
-        about: as of `Format`.
-        text: makes the text of a chain, its parameters (p,) and remarks.
+        name: as in `Format`.
+        file: as in `Format`.
+        about: as in `Format`.
+        text: makes the text from a chain, its parameters (p,) and remarks.
     """
 
     def content(export: Export) -> bytes:
@@ -267,22 +272,22 @@ def kinematics_format(name: str, file: str, about: str, text: Callable[[Chain, F
 
 
 def shortest(value: float) -> str:
-    """Return the shortest decimal number that is read as `value`, without a sign of zero."""
+    """Return the shortest decimal number that reads back as `value`; zero has no sign."""
     return repr(float(value) + 0.0).removesuffix(".0")
 
 
 def _needs(effect: FittedEffect) -> str:
-    """Return the column that an effect needs; empty for none."""
+    """Return the column that an effect needs; "" for none."""
     column = library()[effect.family].column
     return column.format(where=effect.where)
 
 
 def _warnings(grid: CorrectionGrid) -> Iterator[str]:
     for effect in grid.lacking:
-        yield f"{GRID_FILE} has no {effect}, which joint values alone do not tell; `rigcal predict` has it"
+        yield f"{GRID_FILE} leaves out {effect}, which needs more than joint values; `rigcal predict` includes it"
     if grid.is_coarse:
         yield (
-            f"between the nodes of {GRID_FILE}, interpolated corrections are wrong by {grid.rms_mm:.2g} mm RMS, more "
-            f"than a tenth of the {grid.correction_rms_mm:.2g} mm that they are; allow more rows (--rows), or use "
-            "`rigcal predict` or the C header"
+            f"between the nodes of {GRID_FILE}, interpolated corrections have an error of {grid.rms_mm:.2g} mm RMS, "
+            f"more than a tenth of the corrections ({grid.correction_rms_mm:.2g} mm RMS); allow more rows (--rows), or "
+            "use `rigcal predict` or the C header"
         )

@@ -1,4 +1,4 @@
-"""A chain at its parameters as fixed transforms and single motions, the form that URDF, C and MATLAB share."""
+"""A kinematic chain as fixed transforms and single motions, the common form for URDF, C and MATLAB."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from calibration.observations import Floats
 
 @dataclass(frozen=True)
 class Motion:
-    """A fixed transform and, after it, at most one motion.
+    """A fixed transform, followed by at most one motion.
 
     Attributes:
-        name: of the frame that follows, `row3.theta`; `frame3` where a row ends.
-        parent: index of the motion before; -1 for the base.
-        fixed: (4, 4) mm.
-        rotates: True where it turns about its axis, False where it slides along it.
+        name: name of the frame after it: `row3.theta`, or `frame3` at the end of a row.
+        parent: index of the previous motion; -1 for the base.
+        fixed: (4, 4) fixed transform, mm.
+        rotates: True if it rotates about its axis, False if it slides along it.
         axis: 0, 1, 2 for x, y, z.
-        drive: (joint index, rad or mm per deg or mm of its reading); empty where nothing moves.
+        drive: pairs of joint index and rad or mm per deg or mm of the joint's reading; empty if nothing moves.
     """
 
     name: str
@@ -34,13 +34,13 @@ class Motion:
 
 @dataclass(frozen=True)
 class MotionTree:
-    """Motions of a rig as a tree, parents first, and what hangs on them.
+    """Motions of a rig as a tree, with its frames and prisms.
 
     Attributes:
-        motions: see there.
+        motions: the motions, parents first.
         frames: index of the motion that ends in frame 0, 1, ...; -1 for frame 0.
         turning: row number -> index of the motion of its driven theta.
-        prisms: name -> (frame, (3,) place in it, mm).
+        prisms: name -> (frame, (3,) position in it, mm).
     """
 
     motions: tuple[Motion, ...]
@@ -51,13 +51,14 @@ class MotionTree:
 
 @dataclass(frozen=True)
 class Carriers:
-    """The motions of a tree that move, with everything else fixed to them.
+    """The driven motions of a tree, with everything else fixed to them.
 
     Attributes:
-        motions: parents first; each has a drive.
-        frames: frame number -> (motion that carries it, (4, 4) its place after that motion, mm); -1 for the base.
+        motions: the motions, parents first; each has a drive.
+        frames: by frame number: the motion that carries it (-1 for the base), and its (4, 4) transform after that
+            motion, mm.
         turning: row number -> index of the motion of its driven theta.
-        prisms: name -> (motion that carries it, (3,) place after that motion, mm).
+        prisms: name -> (motion that carries it, (3,) position after that motion, mm).
     """
 
     motions: tuple[Motion, ...]
@@ -66,7 +67,7 @@ class Carriers:
     prisms: dict[str, tuple[int, Floats]]
 
     def beyond(self, motion: int) -> list[bool]:
-        """Return for each motion whether another one carries it, itself too."""
+        """Return for each motion whether `motion` carries it; a motion also carries itself."""
         found: list[bool] = []
         for index, one in enumerate(self.motions):
             found.append(index == motion or (one.parent >= 0 and found[one.parent]))
@@ -74,7 +75,7 @@ class Carriers:
 
 
 def carriers(tree: MotionTree) -> Carriers:
-    """Return a tree without the transforms that never move: each is part of what comes after it."""
+    """Return a tree without undriven motions; each is merged into the parts after it."""
     motions: list[Motion] = []
     placed: dict[int, tuple[int, Floats]] = {-1: (-1, np.eye(4))}
     for index, motion in enumerate(tree.motions):
@@ -96,7 +97,7 @@ def _moved(transform: Floats, place: Floats) -> Floats:
 
 
 def motion_tree(chain: Chain, x: Floats) -> MotionTree:
-    """Return a chain at parameters `x` (p,), mm and rad, as motions."""
+    """Return a chain with parameters `x` (p,), mm and rad, as a tree of motions."""
     motions: list[Motion] = []
     frames, turning = [-1], dict[int, int]()
     for number, ops in enumerate(chain.row_ops, 1):

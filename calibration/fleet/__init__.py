@@ -1,1 +1,1 @@
-"""Many rigs of one kind together: what they have in common, how much they differ, and which do not belong."""
+"""Joint analysis of many rigs of one kind: their common mean, their spread, and outliers."""

@@ -1,12 +1,13 @@
-"""A hierarchical estimate of one quantity over many rigs: common mean, spread between rigs, each rig given the others.
+"""Hierarchical estimate of one quantity over many rigs: common mean, spread between rigs, and shrunken values.
 
-Rig i has measured y_i with standard error s_i; its true value is drawn from N(mean, spread^2), so that
-y_i ~ N(mean, spread^2 + s_i^2). The spread is that of Paule and Mandel (J. Res. Natl. Bur. Stand. 87, 1982): the
-weighted sum of squares about the weighted mean equals its degrees of freedom. Rigs that are too far off are found
-first by median and MAD, then against the estimate without them, until the set is the same twice.
+Rig i has measured y_i with standard error s_i. Its true value is drawn from N(mean, spread^2), so that
+y_i ~ N(mean, spread^2 + s_i^2). The spread is estimated by Paule and Mandel (J. Res. Natl. Bur. Stand. 87, 1982): the
+weighted sum of squares about the weighted mean equals its degrees of freedom. Outlying rigs are found first by median
+and MAD, then relative to the estimate without them, until the set of outliers no longer changes.
 
-Few rigs tell well how large the spread is, and a rig that is drawn to the fleet too much looks surer than it is. So the
-mean and each rig's value are averaged over the spreads that the data leave open, weighted by the restricted likelihood.
+With few rigs the spread is uncertain, and a value that is shrunk too far towards the fleet gets too small a standard
+error. The mean and each rig's value are therefore averaged over all plausible spreads, weighted by the restricted
+likelihood.
 """
 
 from __future__ import annotations
@@ -21,31 +22,31 @@ from scipy.special import stdtr
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
-LEAST_RIGS = 5  # fewer tell no spread
+LEAST_RIGS = 5  # fewer rigs do not determine a spread
 _ROUNDS = 20
-_LEVEL = 0.01  # chance that any of the rigs is taken for an outlier where none is
+_LEVEL = 0.01  # probability that any rig is classified as an outlier if there are none
 _TINY = float(np.finfo(np.float64).tiny)
-_GRID = 200  # spreads that are averaged over
-_REACH = 3.0  # standard deviations of the values: larger spreads are out of the question
-_MAD = 1.4826  # of a normal distribution: sigma over MAD
-_LEAST_PRECISION = 1e-9  # of a direction, over that of its parameters: none is left but rounding
-_LEAST_GAIN = 0.19  # of the posterior's precision must be the data's own: sigma below 0.9 of the prior's
+_GRID = 200  # number of spreads to average over
+_REACH = 3.0  # largest spread considered, in standard deviations of the values
+_MAD = 1.4826  # sigma divided by MAD for a normal distribution
+_LEAST_PRECISION = 1e-9  # of a direction, relative to its parameters; a smaller precision is a rounding error
+_LEAST_GAIN = 0.19  # least share of the data in the posterior precision: sigma below 0.9 of the prior's
 
 
 @dataclass(frozen=True)
 class FleetEstimate:
-    """One quantity over n rigs; rigs without it have NaN.
+    """Estimate of one quantity over n rigs; rigs that have not measured it have NaN.
 
     Attributes:
-        mean, mean_sigma: of the fleet without outliers, and its standard error.
-        spread: standard deviation between rigs; 0 where measurement errors explain all differences.
-        rigs: how many rigs the mean and the spread are of.
-        p_common: chance of so large a mean where the true one is 0.
-        estimate, sigma: (n,) each rig's value given its own measurement and the fleet, and its standard error: an
-            outlier keeps its own.
-        deviation: (n,) own measurement from the fleet's mean, in standard deviations of what is expected.
-        p: (n,) chance of so large a deviation.
-        is_outlier: (n,) True where the rig is not of this fleet, in this quantity.
+        mean, mean_sigma: mean of the fleet without outliers, and its standard error.
+        spread: standard deviation between rigs; 0 if measurement errors explain all differences.
+        rigs: number of rigs used for the mean and the spread.
+        p_common: probability of so large a mean if the true mean is 0.
+        estimate, sigma: (n,) value of each rig given its own measurement and the fleet, and its standard error; an
+            outlier keeps its own measurement.
+        deviation: (n,) deviation of each measurement from the fleet's mean, in expected standard deviations.
+        p: (n,) probability of so large a deviation.
+        is_outlier: (n,) True for a rig that does not belong to the fleet in this quantity.
     """
 
     mean: float
@@ -61,14 +62,14 @@ class FleetEstimate:
 
 
 def fleet_estimate(value: Floats, sigma: Floats) -> FleetEstimate | None:
-    """Estimate what rigs have in common.
+    """Estimate the common mean of rigs, their spread, and each rig's value given the fleet.
 
     Args:
-        value: (n,) measured; NaN where a rig has not measured it.
-        sigma: (n,) its standard error, positive.
+        value: (n,) measured values; NaN for a rig that has not measured it.
+        sigma: (n,) standard errors, positive.
 
     Returns:
-        The estimate; None where fewer than LEAST_RIGS rigs have measured it.
+        The estimate; None if fewer than LEAST_RIGS rigs have measured the quantity.
     """
     there = np.isfinite(value) & np.isfinite(sigma) & (sigma > 0)
     if there.sum() < LEAST_RIGS:
@@ -84,7 +85,7 @@ def fleet_estimate(value: Floats, sigma: Floats) -> FleetEstimate | None:
             break
         outside = again
     inside = int((~outside).sum())
-    expected = s**2 + between + np.where(outside, mean_variance, -mean_variance)  # the mean holds those inside
+    expected = s**2 + between + np.where(outside, mean_variance, -mean_variance)  # the mean includes the rigs inside
     deviation = (y - mean) / np.sqrt(np.maximum(expected, 1e-12 * s**2))
     mean, mean_variance, given, given_variance = _averaged(y[~outside], s[~outside])
     estimate, variance = y.copy(), s**2
@@ -113,7 +114,7 @@ def fleet_estimate(value: Floats, sigma: Floats) -> FleetEstimate | None:
 
 
 def _fit(y: Floats, s: Floats) -> tuple[float, float, float]:
-    """Return mean, its variance, and the variance between rigs."""
+    """Return the mean, its variance, and the variance between rigs."""
 
     def excess(between: float) -> float:
         w = 1.0 / (s**2 + between)
@@ -130,7 +131,7 @@ def _fit(y: Floats, s: Floats) -> tuple[float, float, float]:
 
 
 def _averaged(y: Floats, s: Floats) -> tuple[float, float, Floats, Floats]:
-    """Return mean, its variance, each rig's value given all, and its variance, averaged over possible spreads."""
+    """Return the mean, its variance, each rig's value given all rigs, and its variance, averaged over spreads."""
     reach = _REACH * float(np.std(y, ddof=1)) + float(s.min())
     spread = reach * ((np.arange(_GRID) + 0.5) / _GRID)[:, None]
     variance = s**2 + spread**2  # (spreads, rigs)
@@ -141,7 +142,7 @@ def _averaged(y: Floats, s: Floats) -> tuple[float, float, Floats, Floats]:
     log_likelihood = -0.5 * (np.log(variance).sum(axis=1) + np.log(total) + squares)
     weight = np.exp(log_likelihood - log_likelihood.max())
     weight /= weight.sum()
-    drawn = s**2 / variance  # to the mean
+    drawn = s**2 / variance  # shrinkage towards the mean
     given = y + drawn * (mean[:, None] - y)
     given_variance = s**2 * (1.0 - drawn) + drawn**2 / total[:, None]
     best, best_given = float(weight @ mean), weight @ given
@@ -150,7 +151,7 @@ def _averaged(y: Floats, s: Floats) -> tuple[float, float, Floats, Floats]:
 
 
 def _far(y: Floats, s: Floats, mean: float, mean_variance: float, between: float, rigs: int) -> Flags:
-    """Return which rigs are farther off than chance allows any of them to be."""
+    """Return an (n,) mask of rigs that deviate more than chance explains, corrected for the number of rigs."""
     p = _two_sided((y - mean) / np.sqrt(s**2 + between + mean_variance), rigs - 1)
     far: Flags = p < _LEVEL / len(y)
     return far
@@ -161,16 +162,16 @@ def _two_sided(deviation: Floats | float, degrees: int) -> Floats:
 
 
 def widened_prior(value: Floats, covariance: Floats, prior_sigma: Floats, factor: float) -> tuple[Floats, Floats]:
-    """Return the posterior of parameters as it would be with a wider prior about 0.
+    """Return the posterior of parameters for a wider prior about 0.
 
-    Parameters that are known together only share what the prior says of one of them: a constant that is far from its
-    drawing pulls others along. With the whole covariance that is undone.
+    For correlated parameters, the prior of one parameter also acts on the others: a constant that is far from its
+    nominal value shifts them. The full covariance allows that influence to be removed.
 
     Args:
         value: (p,) posterior means.
-        covariance: (p, p) of them.
-        prior_sigma: (p,) of the prior that they were fitted with; infinity for none.
-        factor: by which it is widened.
+        covariance: (p, p) posterior covariance.
+        prior_sigma: (p,) standard deviations of the prior used in the fit; infinity for no prior.
+        factor: factor by which the prior is widened.
 
     Returns:
         (p,) means and (p,) standard errors.
@@ -184,18 +185,18 @@ def widened_prior(value: Floats, covariance: Floats, prior_sigma: Floats, factor
 
 
 def without_prior(value: Floats, sigma: Floats, prior_sigma: Floats) -> tuple[Floats, Floats]:
-    """Return what data alone say of parameters whose posterior has a prior about 0.
+    """Return the estimates from the data alone of parameters whose posterior has a prior about 0.
 
-    Rigs that share a prior are no independent witnesses of what it says. Correlations are passed over, so the prior is
-    to be wide (`widened_prior`): of a parameter that is known only together with others, the marginal posterior counts.
+    Rigs that share a prior are not independent of it, so it must be removed before they are combined. Correlations are
+    ignored: each parameter is treated by its marginal posterior. The prior must therefore be wide (`widened_prior`).
 
     Args:
-        value: (n,) posterior mean.
-        sigma: (n,) posterior standard error.
-        prior_sigma: (n,) of the prior; infinity for none.
+        value: (n,) posterior means.
+        sigma: (n,) posterior standard errors.
+        prior_sigma: (n,) standard deviations of the prior; infinity for no prior.
 
     Returns:
-        (n,) values and (n,) standard errors, NaN where the data hardly added to the prior.
+        (n,) values and (n,) standard errors; NaN where the data added hardly anything to the prior.
     """
     precision, prior = 1.0 / sigma**2, 1.0 / prior_sigma**2
     own = precision - prior
@@ -205,9 +206,16 @@ def without_prior(value: Floats, sigma: Floats, prior_sigma: Floats) -> tuple[Fl
 
 
 def false_discovery_threshold(p: Floats, rate: float) -> float:
-    """Return the largest p that counts, so that at most a share `rate` of what counts is chance.
+    """Return the largest significant p at a false discovery rate, after Benjamini and Hochberg.
 
-    Benjamini and Hochberg (J. R. Stat. Soc. B 57, 1995). NaN is passed over; 0 where nothing counts.
+    Source: J. R. Stat. Soc. B 57, 1995.
+
+    Args:
+        p: p-values of any shape; NaN is ignored.
+        rate: greatest expected share of false discoveries among the significant values.
+
+    Returns:
+        The threshold; 0 if no value is significant.
     """
     known = np.sort(p[np.isfinite(p)])
     passing = np.flatnonzero(known <= rate * np.arange(1, len(known) + 1) / max(len(known), 1))

@@ -1,1 +1,1 @@
-"""Published methods, as their papers have them, to be held against the default."""
+"""Published methods, implemented as in their papers, for comparison with the default method."""

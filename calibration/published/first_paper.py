@@ -1,8 +1,8 @@
-"""The first paper's identification (Zhou et al. 2022): its parallel differential evolution and nothing after it.
+"""The first paper's identification (Zhou et al. 2022): its parallel differential evolution without refinement.
 
-The unknowns are the constants of the rows (the boom's 38); base and unknown prism offsets stay where the nominal model
-puts them, as the paper knows both. The paper does not print its bounds: they follow the rig's build tolerances here,
-and the prior decides how far. Its end result is taken as it is: no local refinement.
+The unknowns are the constants of the rows (38 for the boom). Base and unknown prism offsets keep the values of the
+nominal model, as the paper assumes both known. The paper does not give its bounds: here they are multiples of the rig's
+build tolerances, which the prior determines. The result of the search is not refined locally.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _WIDTH: Mapping[Prior, Mapping[str, float]] = {  # half-width of the bounds in b
     "as-built": {"mm": 60.0, "rad": 30.0},
 }
 _REPEATS = 2
-_SHARE = 0.8  # of the poses that each repeat sees
+_SHARE = 0.8  # share of the poses in each repeat
 
 
 def pde_paper(rig: Rig, observations: Observations, *, prior: Prior, run: Run) -> Solution:
@@ -42,12 +42,12 @@ def pde_paper(rig: Rig, observations: Observations, *, prior: Prior, run: Run) -
     Args:
         rig: the rig description.
         observations: rows with positions.
-        prior: how wide the bounds are: four build tolerances, or what an uncalibrated machine needs.
-        run: of the search, as `evolve_paper`.
+        prior: determines the width of the bounds (`bounds`).
+        run: settings of the search, as for `evolve_paper`.
 
     Raises:
         DataError: a prism that the rig lacks.
-        UnsafeError: a base that cannot be placed, mirrored coordinates, fewer fixes than the unknowns need.
+        UnsafeError: a base that cannot be determined, mirrored coordinates, or too few fixes for the unknowns.
     """
     run.progress(0.0, "placing the base")
     chain, samples, start = place(rig, observations)
@@ -57,7 +57,9 @@ def pde_paper(rig: Rig, observations: Observations, *, prior: Prior, run: Run) -
     rows = np.array([p.kind == "row" for p in chain.parameters])
     different = different_fixes(chain, samples)
     if 3 * different < rows.sum():
-        raise UnsafeError(f"{different} different fixes cannot determine {rows.sum()} constants of the rows")
+        raise UnsafeError(
+            f"{different} different fixes cannot determine {rows.sum()} constants of the rows; measure more poses"
+        )
     objective = _objective(chain, samples, rows, nominal.x)
     evolved = search(objective, bounds(chain, prior)[rows], run=run.part(0.05, 0.9))
     x = nominal.x.copy()
@@ -65,12 +67,13 @@ def pde_paper(rig: Rig, observations: Observations, *, prior: Prior, run: Run) -
     fit = posterior(chain, samples, x, prior=prior)
     warnings = evolved.warnings
     if not evolved.complete:
-        warnings += ("the search was stopped before its end; the result is the best until then",)
+        warnings += ("the search was stopped before its end; the result is the best candidate until then",)
     left_mm, tolerated_mm = rms_left_mm(chain, samples, x), rms_tolerated_mm(chain, samples, nominal)
     if left_mm > tolerated_mm:
         warnings += (
-            f"the search ended {left_mm:.0f} mm RMS off, where build tolerances explain {tolerated_mm:.0f} mm before "
-            f"any fit: it has not come to rest, or the data are not this rig's; --method default says which",
+            f"the error after the search is {left_mm:.0f} mm RMS, but build tolerances explain only "
+            f"{tolerated_mm:.0f} mm before any fit: the search has not converged, or the data are not of this rig; "
+            f"--method default shows which",
         )
     return Solution(
         chain,
@@ -85,9 +88,14 @@ def pde_paper(rig: Rig, observations: Observations, *, prior: Prior, run: Run) -
 
 
 def bounds(chain: Chain, prior: Prior) -> NDArray[np.float64]:
-    """(p,) how far from zero the search may take every parameter, mm or rad.
+    """Return (p,) the largest absolute value of every parameter in the search, mm or rad.
 
-    Four build tolerances, or as built 60 of a length's and 30 of an angle's (the boom's 300 mm and 6 degrees).
+    The bounds are four build tolerances. With the prior `as-built` they are 60 tolerances of a length and 30 of an
+    angle (300 mm and 6 degrees for the boom).
+
+    Args:
+        chain: kinematics.
+        prior: determines the width of the bounds.
     """
     return np.array([p.prior_sigma * _WIDTH[prior][p.unit] for p in chain.parameters])
 
@@ -99,9 +107,16 @@ def search(
     run: Run,
     settings: PaperSettings | None = None,
 ) -> Evolved:
-    """The paper's search of an objective's free parameters within +-`width`: shuffled data, repeated.
+    """Search the free parameters of an objective as the paper does: repeatedly, on shuffled data.
 
-    Arguments and errors as `pde_paper`; `settings` are the paper's by default.
+    Args:
+        objective: the objective.
+        width: (k,) bounds of the free parameters, from -width to width.
+        run: settings of the search, as for `evolve_paper`.
+        settings: settings of the evolution; the paper's by default.
+
+    Raises:
+        DataError: a weighted prism without a fix, or no pose with both prisms of the attitude.
     """
     return evolve_paper(
         [objective.fitness(part) for part in objective.shuffled(_REPEATS, _SHARE, run.seed)],
@@ -114,7 +129,7 @@ def search(
 
 
 def _objective(chain: Chain, samples: Samples, rows: NDArray[np.bool_], at: NDArray[np.float64]) -> PaperObjective:
-    """Eq. 19 with equal weights, and the attitude where two prisms of one frame were measured in the same poses."""
+    """Return Eq. 19 with equal weights; it has the attitude if two prisms of one frame were measured in a same pose."""
     names = chain.rig.prism_names
     present = [names[i] for i in np.unique(samples.data.prism)]
     pose = samples.standstill.astype(str)

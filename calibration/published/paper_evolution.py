@@ -1,9 +1,9 @@
-"""The first paper's parallel differential evolution, to the letter: DE/rand/1/bin with reflection (Eqs. 6-11).
+"""The first paper's parallel differential evolution, exactly as published: DE/rand/1/bin with reflection (Eqs. 6-11).
 
-Mutation draws from the whole population; sub-populations are evaluated side by side wherever the executor puts them.
-The caller mutates one sub-population while others are being evaluated, so that a generation takes little longer than
-its evaluations. Random numbers are counted by candidate, so the result depends neither on the executor, nor on the
-number of sub-populations, nor on an interruption.
+Mutation draws from the whole population; sub-populations are evaluated in parallel by the executor. The caller mutates
+one sub-population while others are evaluated, so that a generation takes little longer than its evaluations. Random
+numbers are indexed by candidate, so the result depends neither on the executor, nor on the number of sub-populations,
+nor on an interruption.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from calibration.observations import Floats
 from calibration.run_settings import Run
 
 _SAVED_EVERY = 20  # generations; a state of the paper's population is nine megabytes
-_LEAST = 4  # a candidate and three others
+_LEAST = 4  # candidates: mutation needs a candidate and three others
 
 
 @dataclass(frozen=True)
@@ -30,11 +30,11 @@ class PaperSettings:
     """The paper's settings.
 
     Attributes:
-        population: candidates.
-        generations: of every search.
+        population: number of candidates.
+        generations: number of generations of every search.
         scale_factor: F.
         crossover: Cr; with 1 every dimension comes from the mutant.
-        subpopulations: how many parts of the population are evaluated side by side.
+        subpopulations: number of parts of the population that are evaluated in parallel.
     """
 
     population: int = 30_000
@@ -49,9 +49,9 @@ class _Population:
     """Candidates of one search and their costs; changed in place.
 
     Attributes:
-        generation: how many it has seen.
-        candidates: (n, p).
-        cost: (n,), never NaN.
+        generation: number of the generation, from 0.
+        candidates: (n, p) parameters.
+        cost: (n,) cost of each candidate, never NaN.
     """
 
     generation: int
@@ -59,7 +59,7 @@ class _Population:
     cost: Floats
 
     def best(self) -> Floats:
-        """(p,) the candidate of least cost."""
+        """Return (p,) the candidate with the least cost."""
         best: Floats = self.candidates[int(self.cost.argmin())].copy()
         return best
 
@@ -73,25 +73,29 @@ def evolve_paper(
     run: Run,
     settings: PaperSettings,
 ) -> Evolved:
-    """Search once for every fitness and take the winner that `judge` finds best.
+    """Search once with every fitness, and return the winner with the least cost by `judge`.
 
     The paper shuffles its data set and repeats the search: `fitnesses` are the objective on shuffled parts of the
-    data (`paper_objective.PaperObjective.shuffled`), `judge` is the objective on all of it.
+    data (`paper_objective.PaperObjective.shuffled`), `judge` is the objective on all data.
 
     Args:
-        fitnesses: one search each; (candidates, p) -> (candidates,), picklable where the executor is a process pool.
-        judge: likewise.
-        lower: (p,) bounds.
-        upper: (p,) bounds.
-        run: seed of all random streams, workers for the sub-populations; it is reported to and asked to stop after
-            every generation, saved every 20 generations, and goes on from a checkpoint of this very search.
-        settings: of the search.
+        fitnesses: cost functions (candidates, p) -> (candidates,), one search each; they must be picklable if the
+            executor is a process pool.
+        judge: cost function of the same form.
+        lower: (p,) lower bounds.
+        upper: (p,) upper bounds.
+        run: seed of all random streams, and workers for the sub-populations. Progress and stop are called after every
+            generation. The state is saved every 20 generations, and the search resumes from a checkpoint of the same
+            search.
+        settings: settings of the search.
 
     Raises:
-        ValueError: no search, or a population of fewer than four.
+        ValueError: no fitness, or a population of fewer than four.
     """
     if not fitnesses or settings.population < _LEAST:
-        raise ValueError(f"{len(fitnesses)} searches of {settings.population} candidates; at least 1 of {_LEAST}")
+        raise ValueError(
+            f"{len(fitnesses)} searches of {settings.population} candidates; at least 1 search of {_LEAST} is needed"
+        )
     lower, upper = np.array(lower, dtype=np.float64), np.array(upper, dtype=np.float64)
     cuts = np.linspace(0, settings.population, settings.subpopulations + 1).astype(int)
     parts = [slice(*ends) for ends in zip(cuts[:-1].tolist(), cuts[1:].tolist(), strict=True)]
@@ -141,7 +145,7 @@ def _advance(
     parts: Sequence[slice],
     trial: Floats,
 ) -> None:
-    """Advance by one generation. Parents are replaced only once every part has been mutated."""
+    """Advance by one generation. Parents are replaced only after every part has been mutated."""
     generation = population.generation + 1
 
     def mutated(part: slice) -> Floats:
@@ -158,7 +162,7 @@ def _advance(
         )
         return trial[part]
 
-    # A part is handed to the executor as soon as it is mutated.
+    # Each part is submitted to the executor as soon as it is mutated.
     costs = executor.map(fitness, (mutated(part) for part in parts))
     for part, trial_cost in zip(parts, costs, strict=True):
         _select(population.candidates[part], population.cost[part], trial[part], np.array(trial_cost))
@@ -176,7 +180,7 @@ def _identity(
     def all_costs(candidates: Floats) -> Floats:
         return np.concatenate([fitness(candidates) for fitness in (*fitnesses, judge)])
 
-    # Sub-populations divide the work and change nothing of the result.
+    # Sub-populations only divide the work and do not change the result.
     undivided = replace(settings, subpopulations=1)
     return problem("paper", all_costs, lower, upper, start=None, seed=seed, settings=undivided)
 
@@ -202,7 +206,7 @@ def _mutate(
     first: int,
     trial: Floats,
 ) -> None:
-    """Trials of the candidates from number `first` on: Eqs. 7-10."""
+    """Write trials of the candidates from index `first` on to `trial`, Eqs. 7-10."""
     n, p = population.shape
     for i in range(len(trial)):
         parent = first + i
@@ -235,7 +239,7 @@ def _mutate(
 
 @compiled
 def _select(population: Floats, cost: Floats, trial: Floats, trial_cost: Floats) -> None:
-    """Greedy selection, Eq. 11; a trial without a cost never wins."""
+    """Replace each candidate by its trial if that has a lower cost, Eq. 11; a trial with cost NaN never wins."""
     n, p = population.shape
     for i in range(n):
         if trial_cost[i] < cost[i]:

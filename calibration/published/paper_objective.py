@@ -1,8 +1,8 @@
 """The first paper's objective: weighted mean squared errors of the prisms, Eq. 19, with the attitude of Eqs. 4 and 5.
 
 F = sum over prisms mu_p e_p^2 / n_p + mu_delta e_delta^2 / n_delta. The attitude of the end is the direction from one
-of two prisms to the other, so its error e_delta is the difference of their position errors (mm, at the distance of the
-two), which leaves out what moves both alike; e_d, the position of the end, is those prisms' own share of the sum.
+of two prisms to the other. Its error e_delta is therefore the difference of their position errors (mm, at the distance
+between them), without errors common to both. The position of the end, e_d, is the part of these prisms in the sum.
 """
 
 from __future__ import annotations
@@ -23,19 +23,19 @@ Integers = NDArray[np.intp]
 
 @dataclass(frozen=True)
 class PaperObjective:
-    """Eq. 19 on a data set or on parts of it.
+    """Objective of Eq. 19 on a data set or on parts of it.
 
     Attributes:
         chain: kinematics.
         data: (n) bound observations.
         position_mm: (n, 3) measured positions.
-        pose: (n,) label of the standstill, unique over sessions and set-ups; fixes of one pose belong together, an
-            empty label stands alone.
-        weight: mu of every prism by its name; a prism that is not named takes no part.
-        attitude: the two prisms that give the end's attitude, None to leave it out.
+        pose: (n,) label of the standstill, unique over sessions and set-ups; fixes with the same label belong together,
+            and a fix with an empty label belongs to no other fix.
+        weight: name of a prism -> mu; a prism that is missing here is not used.
+        attitude: the two prisms that give the end's attitude; None to leave the attitude out.
         attitude_weight: mu_delta.
-        free: (p,) parameters that are searched; all by default.
-        at: (p,) values of the others; zero by default.
+        free: (p,) mask of the parameters that are searched; all by default.
+        at: (p,) values of the other parameters; zero by default.
     """
 
     chain: Chain
@@ -49,7 +49,10 @@ class PaperObjective:
     at: Floats | None = None
 
     def fitness(self, rows: Integers | None = None) -> Fitness:
-        """The objective over the given rows (all by default), by (candidates, free parameters).
+        """Return the objective on the given rows, a function of (candidates, free parameters).
+
+        Args:
+            rows: indices of rows; all by default.
 
         Raises:
             DataError: a weighted prism without a fix, or no pose with both prisms of the attitude.
@@ -60,14 +63,14 @@ class PaperObjective:
         for name, mu in self.weight.items():
             own = data.prism == self._index(name)
             if not own.any():
-                raise DataError("observations", f"prism {name!r} has weight {mu:g} in the objective and no fix")
+                raise DataError("observations", f"prism {name!r} has weight {mu:g} in the objective but no fix")
             weight[own] = mu / own.sum()
         pairs, pair_weight = None, None
         if self.attitude is not None:
             pairs = self._pairs(self.attitude, data, self.pose[rows])
             if len(pairs) == 0:
                 both = " and ".join(map(repr, self.attitude))
-                raise DataError("observations", f"no pose has fixes of both {both}, which give the attitude")
+                raise DataError("observations", f"no pose has fixes of both {both}; the attitude needs one")
             pair_weight = np.full(len(pairs), self.attitude_weight / len(pairs))
         return Fitness.build(
             self.chain,
@@ -81,16 +84,16 @@ class PaperObjective:
         )
 
     def shuffled(self, repeats: int, share: float, seed: int) -> list[Integers]:
-        """Rows of a random part of the data for each repeat of the search.
+        """Return the rows of a random part of the data for each repeat of the search.
 
-        "The data set is shuffled and the search repeated": the order of the terms changes no sum, so a shuffle can
-        only mean that each search sees other data. The poses are shuffled and the first `share` of them taken, at
-        least one; fixes of one pose stay together. Where that leaves a prism or the attitude without data, the next
-        pose that has it is taken too.
+        "The data set is shuffled and the search repeated": the order of terms does not change a sum, so a shuffle can
+        only mean that each search uses different data. The poses are shuffled and the first `share` of them is used, at
+        least one; fixes of one pose stay together. If a prism or the attitude then has no data, the next pose that has
+        such data is added.
 
         Args:
-            repeats: how many parts.
-            share: of the poses, above 0 and at most 1.
+            repeats: number of parts.
+            share: share of the poses, above 0 and at most 1.
             seed: the same seed draws the same parts.
         """
         alone = np.char.add("row ", np.arange(len(self.pose)).astype(str))
@@ -114,11 +117,11 @@ class PaperObjective:
     def _index(self, name: str) -> int:
         names = self.chain.rig.prism_names
         if name not in names:
-            raise DataError("objective", f"the rig has no prism {name!r}; known: {', '.join(map(repr, names))}")
+            raise DataError("objective", f"the rig has no prism {name!r}; it has {', '.join(map(repr, names))}")
         return names.index(name)
 
     def _pairs(self, prisms: tuple[str, str], data: ChainData, pose: NDArray[np.str_]) -> Integers:
-        """(k, 2) rows of the two prisms, one pair for every pose that has both."""
+        """Return (k, 2) rows of the two prisms, one pair for every pose that has both."""
         first, second = (
             {pose[row]: int(row) for row in np.flatnonzero((data.prism == self._index(name)) & (pose != ""))}
             for name in prisms

@@ -1,12 +1,12 @@
-"""The second paper's identifications (ICIC 2020): plain least squares, no priors, nothing robust.
+"""The second paper's identifications (ICIC 2020): plain least squares without priors or robust weights.
 
-Beyond the paper, a step that would raise the squares is halved until it does not.
+In addition to the paper, a step that would increase the sum of squares is halved until it does not.
 
 KM iterates d_phi = (J'J)^-1 J' dP over the kinematic parameters (Eqs. 5-8). SKCM adds one linear compliance for each
-joint with a torque, d_theta = tau C and so dP = J_e tau C (Eqs. 16, 17), and solves for both together. Where J'J is
-singular the paper strikes redundant parameters by hand; here the directions that the data cannot see are found once, on
-the nominal model, and held: every step is the shortest of all equally good ones. RBF-TCM is KM with the network of
-`calibration.residual.rbf.torque_network` on top.
+joint with a torque, d_theta = tau C and so dP = J_e tau C (Eqs. 16, 17), and solves for both together. If J'J is
+singular, the paper removes redundant parameters by hand. Here the directions that the data do not determine are found
+once, on the nominal model, and held: every step is the shortest of all equally good ones. RBF-TCM is KM with the
+network of `calibration.residual.rbf.torque_network` in addition.
 """
 
 from __future__ import annotations
@@ -34,15 +34,15 @@ from calibration.observations import Floats, Observations
 from calibration.rig.description import Rig
 from calibration.run_settings import Run
 
-_SEEN = 1e-6  # singular value over the largest, columns scaled to one length; what repeats another is at 1e-16
+_SEEN = 1e-6  # singular value relative to the largest, for columns of equal length; redundant parameters are at 1e-16
 _ROUNDS = 100
 _HALVINGS = 12
-_SETTLED = 1e-4  # of the error: what a step may still change, as a length
+_SETTLED = 1e-4  # converged if a step changes the positions by less than this share of the error
 
 
 @dataclass(frozen=True)
 class _State:
-    """Parameters and coefficients `z` (p + k,), and what they make of the samples."""
+    """Parameters and coefficients `z` (p + k,), and the linearised model of the samples at `z`."""
 
     z: Floats
     additions: EffectColumns
@@ -54,19 +54,24 @@ class _State:
         return float((self.error**2).sum())
 
     def columns(self) -> Floats:
-        """(3 m, p + k) derivatives of the positions."""
+        """Return (3 m, p + k) derivatives of the positions."""
         added = self.additions.moved_mm(self.lin.joint_jacobian)
         both: Floats = np.concatenate([self.lin.jacobian, added], axis=2).reshape(3 * len(self.error), -1)
         return both
 
 
 def km(rig: Rig, observations: Observations, run: Run) -> Solution:
-    """Kinematic parameters by iterated least squares (Eqs. 5-8).
+    """Identify kinematic parameters by iterated least squares (Eqs. 5-8).
+
+    Args:
+        rig: the rig description.
+        observations: rows with positions.
+        run: receives the progress.
 
     Raises:
         DataError: a prism that the rig lacks.
-        UnsafeError: too few fixes, a base that cannot be placed, mirrored coordinates, another rig's data.
-        CalibrationError: the iteration left the range of numbers.
+        UnsafeError: too few fixes, a base that cannot be determined, mirrored coordinates, or data of a different rig.
+        CalibrationError: the iteration diverged beyond the range of numbers.
     """
     run.progress(0.0, "placing the base")
     chain, samples, start = place(rig, observations)
@@ -81,9 +86,9 @@ def km(rig: Rig, observations: Observations, run: Run) -> Solution:
     left_mm = rms_left_mm(chain, samples, fit.x)
     if left_mm > tolerated_mm:
         raise UnsafeError(
-            f"after plain least squares the fixes are still {left_mm:.0f} mm RMS off, where this rig's build "
-            f"tolerances explain {tolerated_mm:.0f} mm even before it: the method cannot cope with these data; "
-            f"--method default can, or says what is wrong with them"
+            f"after plain least squares the error is still {left_mm:.0f} mm RMS, but this rig's build tolerances "
+            f"explain only {tolerated_mm:.0f} mm even before any fit: the method is not suitable for these data; use "
+            f"--method default, which can fit them or reports what is wrong with them"
         )
     run.progress(0.9, "checking what the data determine")
     seen = identifiability(chain, samples, fit.x, fit.excess_variance)
@@ -92,14 +97,19 @@ def km(rig: Rig, observations: Observations, run: Run) -> Solution:
 
 
 def skcm(rig: Rig, observations: Observations, run: Run) -> Adopted:
-    """Kinematic parameters and one compliance for each joint with a torque, together (Eqs. 16, 17).
+    """Identify kinematic parameters together with one compliance for each joint with a torque (Eqs. 16, 17).
+
+    Args:
+        rig: the rig description.
+        observations: rows with positions.
+        run: receives the progress.
 
     Returns:
         The joint fit with its effects; its `geometric` is the fit of `km`.
 
     Raises:
-        DataError: as `require_torques`, or a prism that the rig lacks.
-        UnsafeError, CalibrationError: as `km`.
+        DataError: as for `require_torques`, or a prism that the rig lacks.
+        UnsafeError, CalibrationError: as for `km`.
     """
     require_torques(rig, observations, "skcm")
     solution = km(rig, observations, run.part(0.0, 0.7))
@@ -123,12 +133,12 @@ def skcm(rig: Rig, observations: Observations, run: Run) -> Adopted:
 
 
 def require_torques(rig: Rig, observations: Observations, method: str) -> None:
-    """Refuse data whose joints carry no known torque.
+    """Raise DataError if the torque of no joint is known.
 
     Args:
         rig: the rig description.
         observations: n rows.
-        method: who asks: `skcm` or `rbf-tcm`.
+        method: method that needs the torques, for the message: `skcm` or `rbf-tcm`.
 
     Raises:
         DataError: there are neither masses in the rig file nor torques measured in every row.
@@ -137,28 +147,28 @@ def require_torques(rig: Rig, observations: Observations, method: str) -> None:
     if not loaded_joints(rig, gravity_torques(chain, np.zeros(len(chain)), observations)):
         raise DataError(
             "observations",
-            f"method {method} needs the torques of joints: give rig {rig.name!r} masses, or the data a column "
-            f"<joint>_Nm that is measured in every row",
+            f"method {method} needs the torques of joints; add masses to rig {rig.name!r}, or to the data a column "
+            f"<joint>_Nm with a value in every row",
         )
 
 
 @dataclass(frozen=True)
 class _Compliances:
-    """The compliances to find, none for kinematics alone; their torques follow the kinematics."""
+    """The compliances to identify, none for kinematics alone; their torques depend on the kinematics."""
 
     samples: Samples
     situation: EffectContext
     choices: tuple[Choice, ...] = ()
 
     def at(self, x: Floats) -> EffectColumns:
-        """Columns of the samples at kinematic parameters x (p,)."""
+        """Return the columns of the samples at kinematic parameters x (p,)."""
         situation = replace(self.situation, x=x)
         found = joined([choice.columns(situation) for choice in self.choices], len(situation))
         return found.over(self.samples.average)
 
 
 def _iterated(chain: Chain, samples: Samples, start: Floats, compliances: _Compliances) -> tuple[Fit, int]:
-    """Least squares from kinematic parameters `start` (p,) and no compliance, and how many rounds it took."""
+    """Iterate least squares from kinematic parameters `start` (p,) and no compliance; return fit and rounds."""
     p = len(chain)
     additions = compliances.at(start)
     state = _state(chain, samples, np.concatenate([start, np.zeros(len(additions))]), additions)
@@ -187,7 +197,7 @@ def _state(chain: Chain, samples: Samples, z: Floats, additions: EffectColumns) 
 
 
 def _directions(state: _State) -> tuple[Floats, Floats]:
-    """(p + k, rank) directions that the data see and (p + k, rest) those they do not."""
+    """Return (p + k, rank) directions that the data determine, and (p + k, rest) those that they do not."""
     columns = state.columns()
     length = np.linalg.norm(columns, axis=0)
     scale = 1.0 / np.where(length > 0.0, length, 1.0)
@@ -198,7 +208,11 @@ def _directions(state: _State) -> tuple[Floats, Floats]:
 
 
 def _step(chain: Chain, samples: Samples, state: _State, seen: Floats) -> tuple[_State, float]:
-    """One step of least squares, halved while it raises the squares; the new state, and the step over the error."""
+    """Make one step of least squares, halved while it increases the squares.
+
+    Returns:
+        The new state, and the size of the full step divided by the size of the error.
+    """
     columns = state.columns() @ seen
     step = np.linalg.lstsq(columns, state.error.ravel(), rcond=None)[0]
     change = float(np.linalg.norm(columns @ step)) / max(math.sqrt(state.squares), 1e-9)
@@ -210,7 +224,7 @@ def _step(chain: Chain, samples: Samples, state: _State, seen: Floats) -> tuple[
 
 
 def _fit(chain: Chain, samples: Samples, state: _State, seen: Floats, unseen: Floats, settled: bool) -> Fit:
-    """The covariance of least squares where the data see, that of the prior where they do not."""
+    """Return the fit: covariance of least squares in determined directions, of the prior in the others."""
     m = len(samples)
     variance = state.squares / (3 * m - seen.shape[1])
     if not math.isfinite(variance):

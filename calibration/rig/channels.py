@@ -1,6 +1,6 @@
-"""Channels of a rig, the devices that its readings and signals come from, and signals that come from none.
+"""Channels, the sources of readings and signals on a rig's buses, and signals that only files contain.
 
-Drivers read them; this only describes.
+This module only describes channels; drivers read them.
 """
 
 from __future__ import annotations
@@ -42,35 +42,35 @@ class _Quantity(BaseModel):
 
 
 class Signal(_Quantity):
-    """A column of observations files beside joints and channels: a tilt, a temperature, a pressure.
+    """A column of observations files in addition to joints and channels: a tilt, a temperature, a pressure.
 
-    No device on the machine's buses is read for it: rows that the daemon stores have none.
+    It is not read from a device on the machine's buses, so the observations that the daemon stores do not have it.
 
     Attributes:
-        name: as in the column, `<name>_<unit>` (`deg/s` is written `deg_per_s`), or `<name>` alone without a unit.
-        unit: of its numbers; "" where they have none, or another one.
+        name: name in the column `<name>_<unit>` (`deg/s` is written `deg_per_s`), or in `<name>` without a unit.
+        unit: unit of the numbers; "" for no unit or for a unit that is not listed.
     """
 
 
 class AnyChannel(_Quantity):
-    """Source of a joint's reading, or of a signal, on the machine's buses; `device` says how it is read.
+    """Source of a joint's reading, or of a signal, on the machine's buses; `device` selects how it is read.
 
     Attributes:
-        name: the joint it reads, or the name of a signal (`boom_valve`).
+        name: name of the joint that the channel reads, or of a signal (`boom_valve`).
         link: name of the CAN link in the daemon's configuration.
-        unit: of the value that the channel yields.
-        timeout_s: silent for longer than this is a gap.
+        unit: unit of the channel's value.
+        timeout_s: silence for longer than this is a gap.
     """
 
     link: str = "boom"
     timeout_s: float = Field(default=1.0, gt=0)
 
     def place(self) -> dict[str, object]:
-        """Return the attributes that decide where on the buses the value is found, by name."""
+        """Return the attributes that determine where on the buses the value is found, by name."""
         return self.model_dump(include=set(_PLACE))
 
     def source(self) -> dict[str, object]:
-        """Return the attributes that decide which device's value it is and what that means, by name: all but times."""
+        """Return the attributes that determine the source and meaning of the value, by name: all except times."""
         return self.model_dump(exclude={"timeout_s", "mode", "period_ms", "heartbeat_ms"})
 
 
@@ -79,10 +79,10 @@ class CanopenChannel(AnyChannel):
 
     Attributes:
         node: CANopen node number.
-        pdo: which TPDO carries the value, 1 to 4.
-        eds: EDS file that gives the PDO mapping; the device's usual mapping when absent.
+        pdo: number of the TPDO that carries the value, 1 to 4.
+        eds: EDS file that defines the PDO mapping; the device's usual mapping if absent.
         mode: `sync` (sampled at every SYNC) or `event_timer` (sent every `period_ms`); used by active set-up.
-        period_ms: event timer.
+        period_ms: period of the event timer.
         heartbeat_ms: heartbeat producer time; 0 switches supervision off.
     """
 
@@ -100,7 +100,7 @@ class Cia406Encoder(CanopenChannel):
     Attributes:
         units_per_revolution: object 6001h (physical resolution 6501h when scaling is off).
         total_units: object 6002h, where the position wraps.
-        sign: +1 or -1, the joint's positive direction against counting direction.
+        sign: +1 if the joint's positive direction is the counting direction, else -1.
         zero_counts: position at which the joint reads zero.
     """
 
@@ -124,8 +124,8 @@ class Cia406Linear(CanopenChannel):
     Attributes:
         object: `6004` or `6020` (multi-sensor devices, sub-index 1).
         step_nm: measuring step, object 6005h.1 or 6501h.
-        sign, zero_counts: as of encoders.
-        range_mm: measuring range; a value beyond it is refused.
+        sign, zero_counts: as for encoders.
+        range_mm: measuring range; a value outside is rejected.
     """
 
     device: Literal["cia406_linear"]
@@ -143,7 +143,7 @@ class Cia404Analogue(CanopenChannel):
     Attributes:
         object: `6130` (REAL32), `7130` (I16) or `9130` (I32), sub-index 1.
         decimal_digits: object 6132h.1, applied to the integer forms.
-        scale, offset: from the device's unit to the channel's: value = reading * scale + offset.
+        scale, offset: conversion from the device's unit to the channel's: value = reading * scale + offset.
     """
 
     device: Literal["cia404"]
@@ -158,8 +158,8 @@ class DbcSignal(AnyChannel):
 
     Attributes:
         dbc: the DBC file, relative to the rig file or to the shipped rigs.
-        message, signal: names in the DBC.
-        scale, offset: from the DBC's physical value to the channel's.
+        message, signal: name in the DBC.
+        scale, offset: conversion from the DBC's physical value: value = physical value * scale + offset.
     """
 
     device: Literal["dbc"]
@@ -171,12 +171,12 @@ class DbcSignal(AnyChannel):
 
 
 class RawSignal(AnyChannel):
-    """A value at a fixed place of a CAN frame, for machines without a DBC.
+    """A value at a fixed place in a CAN frame, for machines without a DBC.
 
     Attributes:
-        arbitration_id, is_extended: the frame.
-        start_bit, length_bits: place, numbered as in a DBC for `byte_order` (Intel: of the least significant bit;
-            Motorola: of the most significant bit).
+        arbitration_id, is_extended: identifier of the frame.
+        start_bit, length_bits: bits of the value, numbered as in a DBC for `byte_order` (the start bit is the least
+            significant bit for Intel, the most significant bit for Motorola).
         byte_order: `intel` (little endian) or `motorola`.
         is_signed: two's complement.
         scale, offset: value = integer * scale + offset.

@@ -1,7 +1,8 @@
-"""Decoding of the channels that a DBC or EDS file describes, as the rig text of a recording keeps it.
+"""The table `[decoding]` of a recorded rig text: how channels of a DBC or EDS file were decoded.
 
-A rig file names such a file and does not change with it. So whoever records adds to the rig's text how each channel was
-decoded: recordings from before and after a change of the DBC's factor are then told from each other.
+A rig file only names its DBC and EDS files, so it does not change when their contents change. The program that records
+therefore adds the decoding of each channel to the rig's text. It distinguishes recordings from before and after a
+change, for example of the DBC's factor.
 """
 
 from __future__ import annotations
@@ -15,11 +16,11 @@ _TABLE = re.compile(r"^\n?\[decoding\]\n(?:[A-Za-z]\w* = \".*\"\n)*", re.MULTILI
 
 
 def with_decoding(text: str, decoding: Mapping[str, str]) -> str:
-    """Return a rig's text with the table `[decoding]`, in place of one that it has.
+    """Return a rig's text with the table `[decoding]` added or replaced.
 
     Args:
         text: TOML.
-        decoding: channel -> how its value is decoded; where it is empty, the text has no such table.
+        decoding: channel -> how its value is decoded; if empty, the text returned has no such table.
     """
     text = without_decoding(text)
     if not decoding:
@@ -29,15 +30,15 @@ def with_decoding(text: str, decoding: Mapping[str, str]) -> str:
 
 
 def without_decoding(text: str) -> str:
-    """Return a rig's text as its file has it."""
+    """Return a rig's text without the table `[decoding]`, as in its file."""
     return _TABLE.sub("", text)
 
 
 def decoded_otherwise(here: Mapping[str, str], there: Mapping[str, str]) -> tuple[str, ...]:
-    """Return the channels that two rigs say are decoded in different ways; one that either says nothing of is none.
+    """Return the channels that two rigs decode differently; a channel must be in both to count.
 
     Args:
-        here: channel -> how its value is decoded.
-        there: the same of the other rig.
+        here: channel -> how its value is decoded, of one rig.
+        there: the same for the other rig.
     """
     return tuple(name for name, told in here.items() if there.get(name, told) != told)

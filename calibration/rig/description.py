@@ -1,7 +1,7 @@
 """The rig description: joints, rows, prisms, masses, channels and station, read from a TOML file.
 
-A rig file is data; nothing here computes kinematics. Rows are numbered from 1 as in the papers; frame i is the frame
-after row i. Files keep degrees and mm, and so does this description.
+A rig file is data; this module does not compute kinematics. Rows are numbered from 1 as in the papers; frame i is the
+frame after row i. Angles are in degrees and lengths in mm, as in the file.
 """
 
 from __future__ import annotations
@@ -55,30 +55,30 @@ __all__ = [
     "shipped_rigs",
 ]
 
-BEYOND_BUILDING = 4.0  # build tolerances: no correction by building alone is larger
-ANOTHER_VALUE = 10.0  # build tolerances: so far off, the file's value is another machine's and tells nothing
+BEYOND_BUILDING = 4.0  # build tolerances: build errors alone never need a larger correction
+ANOTHER_VALUE = 10.0  # build tolerances: a value so far off belongs to a different machine and carries no information
 _MOST = 300  # joints, rows, prisms, masses, channels or signals
 
 
 class Rig(Part):
-    """A machine: everything that calibration, drivers and simulators need to know of it.
+    """A machine: everything that calibration, drivers and simulators need to know about it.
 
-    `Rig.read` reads a rig file, or a rig that comes with the program.
+    `Rig.read` reads a rig file or a shipped rig.
 
     Attributes:
-        name: of the machine.
+        name: name of the machine.
         convention: order of the transforms in a row.
-        gravity: its direction in the base frame, of any length.
+        gravity: direction of gravity in the base frame, of any length.
         joints: the joint values, `[[joint]]` in the file.
         rows: the kinematic table, `[[row]]`.
         prisms: reflectors, `[[prism]]`.
         masses: lumped masses, `[[mass]]`.
-        channels: where readings and signals come from, `[[channel]]`.
+        channels: sources of readings and signals, `[[channel]]`.
         signals: further columns of observations files, `[[signal]]`.
         tolerances: build tolerances.
         station: random error of a fix.
-        decoding: channel -> how the DBC or EDS file that it names decodes its value. The daemon adds it to the rig that
-            it stores with sessions and models; a rig file needs none.
+        decoding: channel -> how its DBC or EDS file decodes its value. The daemon adds this to the rigs that it stores
+            with sessions and models; a rig file does not need it.
     """
 
     name: str
@@ -111,7 +111,7 @@ class Rig(Part):
     @classmethod
     def _points_somewhere(cls, gravity: Vector) -> Vector:
         if not any(gravity):
-            raise ValueError("no direction; [0, 0, -1] is down along the base's z")
+            raise ValueError("must not be zero; [0, 0, -1] points down, along the base's -z axis")
         return gravity
 
     @model_validator(mode="after")
@@ -125,7 +125,7 @@ class Rig(Part):
         ):
             doubled = sorted({n for n in called if called.count(n) > 1})
             if doubled:
-                raise ValueError(f"two {what}s are called {doubled[0]!r}")
+                raise ValueError(f"two {what}s are called {doubled[0]!r}; rename or remove one")
         for fault in signal_faults(self.signals, self.taken):
             raise ValueError(fault)
         return self
@@ -136,15 +136,23 @@ class Rig(Part):
         known = {j.name for j in self.joints}
         for number, _, name, coefficient in self.couplings():
             if name not in known:
-                raise ValueError(f"row {number}: driven by unknown joint {name!r}; joints: {', '.join(sorted(known))}")
+                raise ValueError(
+                    f"row {number}: driven by unknown joint {name!r}; the joints are {', '.join(sorted(known))}"
+                )
             if coefficient == 0.0:
-                raise ValueError(f"row {number}: joint {name!r} drives it by 0; leave it out, or give how far it moves")
+                raise ValueError(
+                    f"row {number}: the coefficient of joint {name!r} is 0; correct it, or remove the joint from drive"
+                )
         if known - driven:
-            raise ValueError(f"joint {sorted(known - driven)[0]!r} drives no row")
+            raise ValueError(
+                f"joint {sorted(known - driven)[0]!r} drives no row; add it to drive of a row, or remove the joint"
+            )
         for channel in self.channels:
             joint = next((j for j in self.joints if j.name == channel.name), None)
             if joint is not None and channel.unit != joint.unit:
-                raise ValueError(f"channel {channel.name!r} is in {channel.unit}, its joint in {joint.unit}")
+                raise ValueError(
+                    f"channel {channel.name!r} is in {channel.unit}, but its joint is in {joint.unit}; correct either"
+                )
         self._require_places_of_their_own([channel for channel in self.channels if channel.name in known])
         return self
 
@@ -154,17 +162,20 @@ class Rig(Part):
         for channel in channels:
             other = taken.setdefault(tuple(channel.place().items()), channel.name)
             if other != channel.name:
-                raise ValueError(f"joints {other!r} and {channel.name!r} are read from the same place on the bus")
+                raise ValueError(
+                    f"joints {other!r} and {channel.name!r} are read from the same place on the bus; "
+                    f"correct the channel of one of them"
+                )
 
     @model_validator(mode="after")
     def _rows_fit(self) -> Rig:
         unused = {"mdh_beta_before": set(), "mdh_beta_after": {"b"}, "dh": {"b"}}[self.convention]
         for number, row in enumerate(self.rows, 1):
             if row.after is not None and row.after >= number:
-                raise ValueError(f"row {number}: it continues from frame {row.after}, which does not come before it")
+                raise ValueError(f"row {number}: after is {row.after}, but must be 0 or the number of an earlier row")
             wrong = unused & ({*row.identify} | ({"b"} if row.b_mm else set()) | ({"beta"} if row.beta_deg else set()))
             if wrong:
-                raise ValueError(f"row {number}: convention {self.convention!r} has no {sorted(wrong)[0]}")
+                raise ValueError(f"row {number}: convention {self.convention!r} has no {sorted(wrong)[0]}; remove it")
         return self
 
     @model_validator(mode="after")
@@ -172,12 +183,16 @@ class Rig(Part):
         last = len(self.rows)
         for prism in self.prisms:
             if prism.frame > last:
-                raise ValueError(f"prism {prism.name!r}: frame {prism.frame} is beyond the last row {last}")
+                raise ValueError(f"prism {prism.name!r}: frame {prism.frame} is too large; the rig has {last} rows")
         for mass in self.masses:
             if mass.frame + mass.midway > last:
-                raise ValueError(f"mass {mass.name!r}: frame {mass.frame} is beyond the last row {last}")
+                needed = f"frame {mass.frame}{' with midway' if mass.midway else ''}"
+                raise ValueError(f"mass {mass.name!r}: {needed} is too large; the rig has {last} rows")
             if mass.midway and self.path(mass.frame + 1)[:-1] != self.path(mass.frame):
-                raise ValueError(f"mass {mass.name!r}: row {mass.frame + 1} does not continue from frame {mass.frame}")
+                raise ValueError(
+                    f"mass {mass.name!r}: row {mass.frame + 1} does not continue from frame {mass.frame}; "
+                    f"give centre_mm instead of midway"
+                )
         return self
 
     @property
@@ -187,13 +202,13 @@ class Rig(Part):
 
     @classmethod
     def read(cls, path_or_shipped_name: str | Path) -> Rig:
-        """Read a rig file, or a rig that comes with the program (`shipped_rigs`).
+        """Read a rig file or a shipped rig (`shipped_rigs`).
 
         Args:
             path_or_shipped_name: path of a TOML file, or a name such as `swdt82`.
 
         Raises:
-            RigError: no such rig or file, or the file is malformed.
+            RigError: there is no such rig or file, or the file is malformed.
         """
         path = rig_path(str(path_or_shipped_name))
         try:
@@ -204,13 +219,13 @@ class Rig(Part):
         return parse_rig(text, path.name)
 
     def with_signals(self, *columns: str) -> Rig:
-        """Return the rig with further signals, as if its file had a `[[signal]]` for each; models of it keep them.
+        """Return the rig with further signals, as if its file had a `[[signal]]` for each; its models keep them.
 
         Args:
-            columns: columns of observations tables, `<name>_<unit>` or `<name>`: `tilt_x_deg`.
+            columns: names of columns of observations tables, `<name>_<unit>` or `<name>`, such as `tilt_x_deg`.
 
         Raises:
-            RigError: a column that cannot be a signal's, or that the rig has already.
+            RigError: a column cannot be a signal, or the rig has it already.
             ValueError: the rig was not read from a text.
         """
         lines = [self._text_to_add_to("the signals").rstrip("\n")]
@@ -222,7 +237,7 @@ class Rig(Part):
         return parse_rig("\n".join((*lines, "")), f"rig {self.name!r}")
 
     def with_decoding(self, decoding: Mapping[str, str]) -> Rig:
-        """Return the rig with another decoding of its channels, in its text as well.
+        """Return the rig with a different decoding of its channels, also in its text.
 
         Args:
             decoding: channel -> how its value is decoded.
@@ -236,28 +251,28 @@ class Rig(Part):
 
     def _text_to_add_to(self, what: str) -> str:
         if not self.text:
-            raise ValueError(f"the rig was not read from a text, to which {what} could be added; use Rig.read")
+            raise ValueError(f"the rig has no text to which {what} could be added; read the rig with Rig.read")
         return self.text
 
     def differences(self, other: Rig) -> tuple[str, ...]:
-        """Return the attributes in which another rig is another machine.
+        """Return the names of the attributes in which another rig describes a different machine.
 
-        Neither its text nor its signals are such, and the decoding of a channel only where both rigs tell it.
+        Texts and signals are not compared. The decoding of a channel is compared only if both rigs have it.
         """
         named = (name for name in type(self).model_fields if name not in ("signals", "decoding"))
         differ = [name for name in named if getattr(self, name) != getattr(other, name)]
         return (*differ, "decoding") if decoded_otherwise(self.decoding, other.decoding) else tuple(differ)
 
     def misreading(self, recorded: Rig) -> str:
-        """Return why readings that were recorded with another rig file are not this one's; "" where they are.
+        """Return why readings recorded with another rig file do not fit this rig; "" if they do.
 
-        Times of a channel may differ, and so may all that is no reading: rows, limits, masses.
+        The times of a channel may differ, and so may everything that does not affect readings: rows, limits, masses.
 
         Args:
-            recorded: the rig file that turned counts into the readings.
+            recorded: the rig file that converted counts to the readings.
 
         Returns:
-            a clause: "its channel L2 has zero_counts = 0, this one -2000".
+            A clause such as "its channel L2 has zero_counts = 0, this one -2000".
         """
         for joint in self.joints:
             if joint.name not in recorded.joint_names:
@@ -276,14 +291,14 @@ class Rig(Part):
         return ""
 
     def couplings(self) -> Iterator[tuple[int, Driven, str, float]]:
-        """Iterate over every (row number from 1, driven constant, joint name, coefficient)."""
+        """Yield every coupling as (row number from 1, driven constant, joint name, coefficient)."""
         for number, row in enumerate(self.rows, 1):
             for driven, combination in row.drive.items():
                 for name, coefficient in combination.items():
                     yield number, driven, name, coefficient
 
     def path(self, frame: int) -> tuple[int, ...]:
-        """Return the numbers of the rows between the base and a frame, the base's end first; none for frame 0."""
+        """Return the numbers of the rows from the base to a frame, in this order; empty for frame 0."""
         numbers: list[int] = []
         while frame > 0:
             numbers.append(frame)
@@ -291,13 +306,13 @@ class Rig(Part):
         return tuple(reversed(numbers))
 
     def joint(self, name: str) -> Joint:
-        """Return the joint called `name`; KeyError, which names those that there are, if there is none."""
+        """Return the joint called `name`; raise KeyError, whose message lists the joints, if there is none."""
         if name not in self.joint_names:
             raise KeyError(f"rig {self.name!r} has no joint {name!r}; it has {', '.join(self.joint_names)}")
         return self.joints[self.joint_names.index(name)]
 
     def prism(self, name: str) -> Prism:
-        """Return the prism called `name`; KeyError, which names those that there are, if there is none."""
+        """Return the prism called `name`; raise KeyError, whose message lists the prisms, if there is none."""
         if name not in self.prism_names:
             raise KeyError(f"rig {self.name!r} has no prism {name!r}; it has {', '.join(self.prism_names)}")
         return self.prisms[self.prism_names.index(name)]
@@ -314,7 +329,7 @@ class Rig(Part):
 
     @property
     def taken(self) -> Taken:
-        """Names and columns that no signal can have."""
+        """Names and columns that a signal cannot have."""
         return Taken.by(self.joint_names, self.prism_names, self.channels)
 
 
@@ -339,8 +354,8 @@ def parse_rig(text: str, source: str) -> Rig:
         source: file name for messages.
 
     Raises:
-        RigError: malformed TOML, unknown keys, impossible values, parts that do not fit each other; of several faults
-            the one that tells most.
+        RigError: malformed TOML, unknown keys, impossible values, or parts that do not fit together. Only the most
+            informative of several faults is raised.
     """
     rig, faults = read_rig(text, source)
     if rig is None:
@@ -349,14 +364,14 @@ def parse_rig(text: str, source: str) -> Rig:
 
 
 def read_rig(text: str, source: str) -> tuple[Rig | None, tuple[RigError, ...]]:
-    """Read a rig description, or find all that is wrong with it.
+    """Read a rig description, or find all its faults.
 
     Args:
         text: TOML.
         source: file name for messages.
 
     Returns:
-        The rig, None where there are faults; the faults, that which tells most first.
+        The rig, or None if there are faults; and the faults, the most informative first.
     """
     try:
         raw = parse_toml(text)
@@ -365,9 +380,9 @@ def read_rig(text: str, source: str) -> tuple[Rig | None, tuple[RigError, ...]]:
     try:
         rig = Rig.model_validate(raw)
     except ValidationError as error:
-        # A misspelt key is unknown and missing; the spelling tells more.
+        # A misspelt key is both unknown and missing; the unknown key is more informative.
         found = sorted(error.errors(), key=lambda e: e["type"] != "extra_forbidden")
-        # Tables that are wrong do not count as there
+        # Faulty tables count as missing, so the list seems too short
         own = [e for e in found if e["type"] != "too_short"] or found
         return None, tuple(_fault(text, source, each) for each in own)
     rig._text = text
@@ -375,34 +390,35 @@ def read_rig(text: str, source: str) -> tuple[Rig | None, tuple[RigError, ...]]:
 
 
 def _fault(text: str, source: str, error: ErrorDetails) -> RigError:
-    """Return the fault that one of pydantic's errors is about."""
+    """Return the fault that an error of pydantic reports."""
     where, why = place(error), _reason(error)
     return RigError(source, ".".join(map(str, where)), why, line_of(text, where or _named_in(why)))
 
 
 def _named_in(why: str) -> tuple[str | int, ...]:
-    """Return the key of the table that a sentence of the rig as a whole begins with: `row 3: ...` -> row, 3."""
+    """Return the place of the table with which a message about the whole rig begins: `row 3: ...` -> row, 3."""
     section, _, rest = why.partition(" ")
     number, _, _ = rest.partition(":")
     return (section, int(number)) if section in _SECTIONS and number.isdecimal() else ()
 
 
 def _reason(error: ErrorDetails) -> str:
-    """Return the fault that one of pydantic's errors is about."""
+    """Return the message for an error of pydantic."""
     if error["type"] == "missing":
         return "missing; it is required"
     if error["type"] == "extra_forbidden":
         *inside, _ = (part for part in error["loc"] if isinstance(part, str))
         section = _SECTIONS.get(".".join(inside))
         fields = section.model_fields.items() if section else ()
-        allowed = [field.alias or name for name, field in fields if name != "decoding"]  # nobody writes it by hand
-        return "unknown key" + (f"; there are {', '.join(allowed)}" if allowed else "")
+        allowed = [field.alias or name for name, field in fields if name != "decoding"]  # users do not write it
+        return "unknown key" + (f"; allowed here: {', '.join(allowed)}" if allowed else "")
     return reason(error, Rig)
 
 
 def shipped_rig(name: str) -> Rig:
-    """Return a rig that comes with the program; RigError if there is none of that name."""
+    """Return the shipped rig called `name`; raise RigError if there is none."""
     if name not in shipped_rigs():
-        raise RigError(name, "", f"no such rig; shipped: {', '.join(shipped_rigs())}, or give a path to a TOML file")
+        names = ", ".join(shipped_rigs())
+        raise RigError(name, "", f"no such rig; give a shipped rig ({names}) or the path of a TOML file")
     path = rig_path(name)
     return parse_rig(path.read_text(encoding="utf-8"), path.name)

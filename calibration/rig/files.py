@@ -1,4 +1,4 @@
-"""Rig files: those that come with the program by their names, any other by its path."""
+"""Paths of rig files: shipped rigs by name, other files by path."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ _ENDING = ".toml"
 
 
 def shipped_rigs() -> tuple[str, ...]:
-    """Return the names of the rigs that come with the program."""
+    """Return the names of the shipped rigs."""
     return tuple(sorted(f.name.removesuffix(_ENDING) for f in _directory().iterdir() if f.name.endswith(_ENDING)))
 
 
@@ -19,7 +19,7 @@ def rig_path(name_or_path: str) -> Path:
     """Return the path of a rig's file.
 
     Args:
-        name_or_path: name of a rig that comes with the program, or path of a file.
+        name_or_path: name of a shipped rig, or path of a file.
 
     Raises:
         RigError: there is no such rig or file.
@@ -32,8 +32,10 @@ def rig_path(name_or_path: str) -> Path:
         return path
     names = ", ".join(shipped)
     if "/" in name_or_path or name_or_path.endswith(_ENDING):
-        raise RigError(name_or_path, "", f"there is no such file; name one that there is, or a shipped rig ({names})")
-    raise RigError(name_or_path, "", f"neither a shipped rig ({names}) nor a rig file")
+        raise RigError(name_or_path, "", f"there is no such file; give another path, or a shipped rig ({names})")
+    raise RigError(
+        name_or_path, "", f"neither a shipped rig ({names}) nor a rig file; give one of these names or a path"
+    )
 
 
 def _directory() -> Path:

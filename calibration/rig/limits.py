@@ -1,4 +1,4 @@
-"""Readings and the limits of their joints: which whole turns change nothing, and what lies beyond."""
+"""Joint readings and joint limits: removal of whole turns, and detection of values beyond the limits."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 _TURN_DEG = 360.0
-_SLACK = 0.05  # of a joint's range: a zero or a limit of the file may be off by so much
-_IMMOBILE = 0.01  # of the same: less is no motion
+_SLACK = 0.05  # of a joint's range: tolerated error of a zero or a limit in the file
+_IMMOBILE = 0.01  # of a joint's range: a smaller range of readings is not a motion
 
 
 def turns_deg(rig: Rig) -> Floats:
-    """Return (joints,): 360 for joints whose whole turns leave the machine where it is, else 0.
+    """Return (joints,): 360 for each joint whose whole turns do not change the machine's pose, else 0.
 
-    That is so of a revolute joint that turns rows by whole multiples; behind a gear, or where an angle drives a length,
-    a turn is another place.
+    These are the revolute joints that drive only angles, with whole-number coefficients. With a gear, or if the angle
+    drives a length, a whole turn changes the pose.
     """
     lasting = {
         name for _, driven, name, coefficient in rig.couplings() if driven != "theta" or not coefficient.is_integer()
@@ -32,14 +32,17 @@ def turns_deg(rig: Rig) -> Floats:
 
 
 def on_one_turn(rig: Rig, joints: Mapping[str, Floats]) -> dict[str, Floats]:
-    """Bring readings, recorded on any turn of their encoders, to the turn inside the limits of their joints.
+    """Shift readings, recorded on any turn of their encoders, by whole turns into the limits of their joints.
 
-    Readings that no whole turn brings there stay as they were: those of an encoder that is turned or reversed still
-    belong together.
+    Readings that no whole turn brings inside the limits are unchanged, so that the readings of an encoder that is
+    mounted turned or reversed remain consistent.
 
     Args:
         rig: the machine.
-        joints: joint -> (n,) deg or mm.
+        joints: joint -> (n,) readings, deg or mm.
+
+    Returns:
+        joint -> (n,) readings on the turn of the limits.
     """
     found = dict(joints)
     for joint, turn in zip(rig.joints, turns_deg(rig).tolist(), strict=True):
@@ -52,12 +55,12 @@ def on_one_turn(rig: Rig, joints: Mapping[str, Floats]) -> dict[str, Floats]:
 
 
 def beyond_limits(joint: Joint, values: Floats, share: float) -> Flags:
-    """Return an (n,) mask of values, deg or mm, beyond the joint's limits by more than a share of their range."""
+    """Return an (n,) mask of values, deg or mm, beyond the joint's limits by more than `share` of their range."""
     low, high = joint.limits
     margin = share * (high - low)
     return np.asarray((values < low - margin) | (values > high + margin))
 
 
 def never_moved(joint: Joint, low: float, high: float) -> bool:
-    """Return True if readings from `low` to `high`, deg or mm, are of a joint that stood still."""
+    """Return True if readings between `low` and `high`, deg or mm, mean that the joint did not move."""
     return high - low < _IMMOBILE * (joint.limits[1] - joint.limits[0])

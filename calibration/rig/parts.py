@@ -1,6 +1,6 @@
-"""The parts of a rig: joints, rows, prisms, masses, tolerances and station, as a rig file has them.
+"""The parts of a rig file: joints, rows, prisms, masses, tolerances and station.
 
-Files keep degrees and mm, and so do these. Rows are numbered from 1; frame i is the frame after row i.
+Angles are in degrees and lengths in mm, as in the file. Rows are numbered from 1; frame i is the frame after row i.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ RowParameter = Literal["alpha", "a", "d", "theta", "beta", "b"]
 Driven = Literal["theta", "d", "a"]
 Convention = Literal["mdh_beta_after", "mdh_beta_before", "dh"]
 
-NEARLY_PARALLEL = math.cos(math.radians(15.0))  # beyond it the other constants turn an axis within their tolerances
+NEARLY_PARALLEL = math.cos(math.radians(15.0))  # at larger angles other constants can tilt an axis within tolerance
 _OF_FIXES = frozenset(names((*POSITION, *SIGMA, *WRITTEN)))  # columns of a fix and of its prediction
 
 
@@ -32,13 +32,13 @@ class Joint(Part):
     """A joint value: what one encoder or length transducer reads.
 
     Attributes:
-        name: as in the observations CSV (`theta1`, `L2`).
+        name: name as in the observations CSV (`theta1`, `L2`).
         kind: `revolute` (values in deg) or `prismatic` (mm).
         limits: lowest and highest value, deg or mm.
         sigma: random error of a reading, 1 sigma, deg or mm; enters the observation covariance.
         resolution: quantisation step of the reading, deg or mm.
-        linearity: systematic error bound, deg, or a fraction of the stroke for `prismatic`; no noise.
-        max_rate: fastest motion, deg/s or mm/s; a faster jump is no motion.
+        linearity: bound of the systematic error, deg, or a fraction of the stroke for `prismatic`; not noise.
+        max_rate: fastest motion, deg/s or mm/s; a faster change of the reading is an error, not a motion.
     """
 
     name: str = Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")
@@ -62,13 +62,15 @@ class Joint(Part):
     @model_validator(mode="after")
     def _limits_in_order(self) -> Joint:
         if self.limits[0] >= self.limits[1]:
-            raise ValueError(f"limits must rise, got {self.limits[0]} .. {self.limits[1]}")
+            raise ValueError(f"limits are {self.limits[0]} .. {self.limits[1]}; the first must be less than the second")
         return self
 
     @model_validator(mode="after")
     def _column_of_its_own(self) -> Joint:
         if self.column in _OF_FIXES:
-            raise ValueError(f"no joint can be called {self.name!r}: its column {self.column} is one of the fix's")
+            raise ValueError(
+                f"the name {self.name!r} is reserved: the column {self.column} belongs to the fix; rename the joint"
+            )
         return self
 
 
@@ -76,8 +78,8 @@ class FixedTransform(Part):
     """A constant transform before a row: Trans(x,y,z) Rot(z) Rot(y) Rot(x), applied in that order.
 
     Attributes:
-        x_mm, y_mm, z_mm: shift.
-        rz_deg, ry_deg, rx_deg: turns.
+        x_mm, y_mm, z_mm: translation along the axis in the key's name.
+        rz_deg, ry_deg, rx_deg: rotation about the axis in the key's name.
     """
 
     x_mm: float = 0.0
@@ -98,15 +100,15 @@ class Row(Part):
             Denavit-Hartenberg, with Hayati's beta for a next axis that is nearly parallel)
 
     Attributes:
-        alpha_deg, a_mm, d_mm, theta_deg, beta_deg, b_mm: constant of the row, as its convention has it.
-        drive: for `theta`, `d` or `a`: which joints move it, as a linear combination `{ joint = coefficient }`.
-        identify: which of the row's constants calibration may correct; in a rig, a row that says nothing also has beta
-            where it alone can tilt an axis: where that is nearly parallel to the next, or the next row slides along `a`
-            before it turns.
+        alpha_deg, a_mm, d_mm, theta_deg, beta_deg, b_mm: constant of the row, as the convention defines it.
+        drive: the joints that move `theta`, `d` or `a`: for each, a linear combination `{ joint = coefficient }`.
+        identify: the constants of the row that calibration may correct. Without this key, beta is added where only
+            beta can tilt an axis: where the axis is nearly parallel to the next one, or where the next row slides along
+            `a` before it turns.
         before: a fixed transform between the previous frame and this row.
-        after: the frame that this row continues from, where it is not the one before it: rows may branch as a tree.
-        radius_mm: half the width of the link from the frame before to this row's; `plan` keeps others clear of it, and
-            assumes one without this.
+        after: the frame that this row continues from, by default that of the previous row; rows may branch as a tree.
+        radius_mm: half the width of the link between the previous frame and this row's frame. `plan` keeps other links
+            clear of it, and assumes a value if there is none.
     """
 
     alpha_deg: float = 0.0
@@ -126,10 +128,10 @@ class Prism(Part):
     """A reflector.
 
     Attributes:
-        name: as in the observations CSV.
-        frame: fixed to the frame after this row (0: the base).
-        offset_mm: place in that frame.
-        offset_known: false for a target whose mounting is unknown: it is fitted even at stage nominal.
+        name: name as in the observations CSV.
+        frame: number of the row whose frame the prism is fixed to (0: the base).
+        offset_mm: position in that frame.
+        offset_known: false if the mounting is unknown: the offset is then fitted even at stage nominal.
     """
 
     name: str = Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")
@@ -142,15 +144,15 @@ class Mass(Part):
     """A lumped mass.
 
     Attributes:
-        name: which part of the machine.
-        frame: fixed to the frame after this row.
-        kg: mass; a payload's is what is carried unless `payload_kg` is measured.
-        centre_mm: centre of gravity in that frame; none with `midway`.
-        inertia_kg_m2: xx, yy, zz, xy, xz, yz about the centre, along the frame's axes; kept for exports, as gravity
-            does not need it.
-        midway: the centre is midway between the origins of frames `frame` and `frame` + 1.
-        payload: this is the payload that `payload_kg` replaces.
-        assumed: not measured and not from the maker.
+        name: the part of the machine.
+        frame: number of the row whose frame the mass is fixed to (0: the base).
+        kg: the mass; for a payload, the mass carried if `payload_kg` is not measured.
+        centre_mm: centre of gravity in that frame; must be missing with `midway`.
+        inertia_kg_m2: xx, yy, zz, xy, xz, yz about the centre, along the frame's axes; used only by exports, as gravity
+            does not depend on it.
+        midway: true if the centre is midway between the origins of frames `frame` and `frame` + 1.
+        payload: true if this is the payload, whose mass `payload_kg` replaces.
+        assumed: true if the value was neither measured nor given by the manufacturer.
     """
 
     name: str
@@ -173,10 +175,10 @@ class Tolerances(Part):
     """Build tolerances, 1 sigma: how far the machine may be from its nominal model.
 
     Attributes:
-        length_mm: of a length, `a`, `d` and `b`.
-        angle_deg: of an angle, `alpha` and `theta`.
-        beta_deg: of `beta`.
-        prism_mm: of each coordinate of a prism's offset.
+        length_mm: tolerance of a length: `a`, `d` and `b`.
+        angle_deg: tolerance of an angle: `alpha` and `theta`.
+        beta_deg: tolerance of `beta`.
+        prism_mm: tolerance of each coordinate of a prism's offset.
     """
 
     length_mm: float = Field(gt=0)
@@ -189,10 +191,10 @@ class Station(Part):
     """Random error of a fix, 1 sigma.
 
     Attributes:
-        angle_sigma_arcsec: each circle.
-        distance_sigma_mm, distance_sigma_ppm: a + b * distance.
-        target_sigma_mm: centring on the prism and vibration of the machine, each axis.
-        timing_sigma_s: uncertainty of a fix's instant (design: 5 ms unless the link is known better).
+        angle_sigma_arcsec: error of each circle reading.
+        distance_sigma_mm, distance_sigma_ppm: error of the distance: a + b * distance.
+        target_sigma_mm: error of centring on the prism and vibration of the machine, along each axis.
+        timing_sigma_s: uncertainty of a fix's timestamp (by design 5 ms, unless the link is known to be better).
     """
 
     angle_sigma_arcsec: float = Field(default=5.0, gt=0)
@@ -209,7 +211,10 @@ def continues_from(rows: Sequence[Row], number: int) -> int:
 
 
 def tilting_rows(rows: Sequence[Row], convention: Convention) -> set[int]:
-    """Return the rows whose beta alone tilts an axis: one nearly parallel to that before it, or a slide."""
+    """Return the numbers of the rows whose beta is the only constant that can tilt an axis.
+
+    Such an axis is nearly parallel to the previous one, or is the direction of a slide along `a`.
+    """
     tilting = set()
     for number, row in enumerate(rows, 1):
         before = continues_from(rows, number)
@@ -224,7 +229,7 @@ def tilting_rows(rows: Sequence[Row], convention: Convention) -> set[int]:
         }[convention]
         if abs(_turned("z", between)["z"]) > NEARLY_PARALLEL:
             tilting.add(tilts)
-        # Here `a` slides along x of the frame before, which nothing but its beta turns out of its x and y.
+        # Here `a` slides along x of the previous frame, which only that frame's beta tilts out of its x-y plane.
         slides = convention == "mdh_beta_after" and "a" in row.drive
         if slides and abs(_turned("x", mount)["y"]) < NEARLY_PARALLEL:
             tilting.add(before)
@@ -232,7 +237,7 @@ def tilting_rows(rows: Sequence[Row], convention: Convention) -> set[int]:
 
 
 def _turned(axis: str, turns: Sequence[tuple[str, float]]) -> dict[str, float]:
-    """Return the unit vector along an axis after turns about x, y or z by so many degrees."""
+    """Return the unit vector along `axis` after rotations, given as pairs of axis (x, y or z) and angle in deg."""
     vector = {"x": 0.0, "y": 0.0, "z": 0.0, axis: 1.0}
     for about, angle_deg in reversed(turns):
         u, v = {"x": ("y", "z"), "y": ("z", "x"), "z": ("x", "y")}[about]

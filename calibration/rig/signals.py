@@ -1,4 +1,4 @@
-"""Signals of a rig: from a column's name to its `[[signal]]`, and which names are free."""
+"""Signals of a rig: the `[[signal]]` for a column, and the names that signals cannot have."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ _ENDINGS = sorted(
 )
 _READ_ANYWAY = re.compile(r"[A-Za-z][A-Za-z0-9_]*_(bar|mA)")
 _NEITHER_LETTER_NOR_DIGIT = re.compile(r"[^A-Za-z0-9]+")
-# What learners call the features that they compute themselves.
+# Names that learners give to the features that they compute.
 _FEATURE = re.compile(r"(frame\d+|prism|deflection|rbfn)_[xyz]_mm|torque_.*_Nm?")
 
 
 def is_read_anyway(column: str) -> bool:
-    """Return True for a pressure or a current, `<signal>_bar` or `<signal>_mA`, which no rig file needs to name."""
+    """Return True for a pressure or current, `<signal>_bar` or `<signal>_mA`, which is read without a `[[signal]]`."""
     return _READ_ANYWAY.fullmatch(column) is not None
 
 
@@ -32,8 +32,8 @@ class Taken:
     """Names and columns of a rig that its signals cannot have.
 
     Attributes:
-        names: name -> kind of thing that has it: joint, prism or channel.
-        columns: of observations tables, of joints and channels.
+        names: name -> the kind of part that has it: joint, prism or channel.
+        columns: columns of observations tables that joints, channels and rigcal itself use.
     """
 
     names: Mapping[str, str]
@@ -41,7 +41,13 @@ class Taken:
 
     @classmethod
     def by(cls, joints: Sequence[str], prisms: Iterable[str], channels: Collection[Channel]) -> Taken:
-        """Return what joints and prisms of these names, and channels, leave to no signal."""
+        """Return the names and columns that the given joints, prisms and channels occupy.
+
+        Args:
+            joints: names of the joints.
+            prisms: names of the prisms.
+            channels: the channels.
+        """
         names = dict.fromkeys((channel.name for channel in channels), "channel")
         names |= dict.fromkeys(prisms, "prism") | dict.fromkeys(joints, "joint")
         return cls(names, frozenset(own_columns(joints)) | {channel.column for channel in channels})
@@ -51,8 +57,9 @@ def signal_of(column: str, taken: Collection[str]) -> Signal:
     """Return the signal that has a column of this name.
 
     Args:
-        column: as in the header of a table.
-        taken: names that it cannot have: there, as in `q1_degC` beside a joint q1, the unit stays a part of the name.
+        column: name of a column, as in the header of a table.
+        taken: names that a signal cannot have. If the name without its unit is taken, as for `q1_degC` in a rig with a
+            joint q1, the unit remains part of the name.
 
     Raises:
         ValueError: no signal can have this column.
@@ -64,30 +71,36 @@ def signal_of(column: str, taken: Collection[str]) -> Signal:
         return Signal(name=name, unit=unit)
     except ValidationError:
         raise ValueError(
-            f"{column!a} cannot be a signal's column: letters, digits and underscores, a letter first, and the unit "
-            f"last, as in tilt_x_deg"
+            f"{column!a} cannot be the column of a signal; use letters, digits and underscores, a letter first and the "
+            f"unit last, as in tilt_x_deg"
         ) from None
 
 
 def signal_lines(signal: Signal) -> tuple[str, str, str]:
-    """Return the lines of a rig file that make a signal."""
+    """Return the lines of a rig file that define a signal."""
     return "[[signal]]", f'name = "{signal.name}"', f'unit = "{signal.unit}"'
 
 
 def signal_faults(signals: Iterable[Signal], taken: Taken) -> Iterator[str]:
-    """Yield why signals of a rig cannot be: each is a name that something else has."""
+    """Yield a message for each signal whose name or column is taken.
+
+    Args:
+        signals: signals of a rig.
+        taken: the names and columns that other parts of the rig have.
+    """
     for signal in signals:
         if signal.column in taken.columns:
-            yield f"signal {signal.name!r}: the column {signal.column} is known without it; leave it out"
+            yield f"signal {signal.name!r}: the column {signal.column} is already defined; remove the signal"
         elif signal.name in taken.names:
-            read = "; its column is read without it" if is_read_anyway(signal.column) else ""
-            yield f"signal {signal.name!r}: a {taken.names[signal.name]} is called so{read}"
+            is_read = is_read_anyway(signal.column)
+            todo = "remove the signal, as its column is read without it" if is_read else "rename the signal"
+            yield f"signal {signal.name!r}: a {taken.names[signal.name]} has the same name; {todo}"
         elif _FEATURE.fullmatch(signal.column):
-            yield f"signal {signal.name!r}: rigcal computes something called {signal.column}; give it another name"
+            yield f"signal {signal.name!r}: rigcal computes a column {signal.column} itself; rename the signal"
 
 
 def how_to_use(column: str, taken: Taken) -> str:
-    """Return a sentence on how a column of numbers that nothing uses can be used."""
+    """Return a sentence that explains how to use a column of numbers that is not used."""
     fitting = _NEITHER_LETTER_NOR_DIGIT.sub("_", column).strip("_")
     for name in (column, fitting, f"signal_{fitting}"):
         try:
@@ -99,7 +112,7 @@ def how_to_use(column: str, taken: Taken) -> str:
         rename = "" if name == column else f"rename it to {name} and "
         header, *keys = signal_lines(signal)
         return (
-            f"column {column!a} holds numbers and is not used; to use it, {rename}add --signal {name}, or to the rig "
-            f"file the three lines {header}, {' and '.join(keys)}"
+            f"column {column!a} holds numbers but is not used; to use it, {rename}add --signal {name}, or add to the "
+            f"rig file the three lines {header}, {' and '.join(keys)}"
         )
-    return f"column {column!a} holds numbers and is not used; a signal needs another name"
+    return f"column {column!a} holds numbers but is not used; to use it as a signal, give it another name"

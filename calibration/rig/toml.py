@@ -1,6 +1,7 @@
-"""TOML: texts that someone else may have written, by tomllib with bounds on time, depth and numbers; and quoting.
+"""Parsing of untrusted TOML with bounds on time, depth and numbers; and quoting.
 
-tomllib takes the square of the number of parts of a dotted key, and Python's integers have no end.
+The time that tomllib needs grows with the square of the number of parts of a dotted key, and Python's integers are
+unbounded.
 """
 
 from __future__ import annotations
@@ -10,8 +11,8 @@ import tomllib
 from collections.abc import Sequence
 from typing import Any
 
-LONGEST = 1 << 19  # characters; the largest rig that is known has 6,000
-_PARTS_MAX = 100  # of the dotted keys of a line
+LONGEST = 1 << 19  # characters; the largest known rig has 6,000
+_PARTS_MAX = 100  # of the dotted keys in a line
 _PART = re.compile(r"""[\w"'-][ \t]*\.(?=[ \t]*[\w"'-])""")
 _INTEGER_MAX = 1 << 63
 _HEADER = re.compile(r"\s*\[\[?\s*([\w.-]+)\s*\]\]?\s*(#.*)?")
@@ -22,23 +23,24 @@ def parse_toml(text: str) -> dict[str, Any]:
     """Parse a TOML document.
 
     Raises:
-        ValueError: it is no TOML, too long, nested too deeply, or has numbers beyond 64 bits; the message says where.
+        ValueError: the text is not TOML, is too long, is nested too deeply, or has numbers beyond 64 bits; the message
+            names the place.
     """
     if len(text) > LONGEST:
-        raise ValueError(f"it has {len(text):,} characters, {LONGEST:,} at most are read")
+        raise ValueError(f"the text has {len(text):,} characters; the maximum is {LONGEST:,}")
     for number, line in enumerate(text.splitlines(), 1):
         if len(line) > 2 * _PARTS_MAX and len(_PART.findall(line)) > _PARTS_MAX:
-            raise ValueError(f"line {number}: more than {_PARTS_MAX} points; what is meant by it?")
+            raise ValueError(f"line {number}: more than {_PARTS_MAX} dots in its keys; use tables instead")
     try:
-        document = tomllib.loads(text.removeprefix("\ufeff"))  # a mark that editors on Windows set
+        document = tomllib.loads(text.removeprefix("\ufeff"))  # the byte-order mark of Windows editors
     except RecursionError as error:
-        raise ValueError("nested too deeply") from error
+        raise ValueError("arrays or tables are nested too deeply") from error
     _check_integers(document)
     return document
 
 
 def quoted(text: str) -> str:
-    """Return a text as a TOML string; what cannot be seen is escaped."""
+    """Return a text as a TOML string; characters that are not printable are escaped."""
     return '"' + "".join(c if c.isprintable() and c not in '"\\' else f"\\U{ord(c):08x}" for c in text) + '"'
 
 
@@ -51,14 +53,14 @@ def _check_integers(document: dict[str, Any]) -> None:
         elif isinstance(value, list):
             waiting += [(key, item) for item in value]
         elif isinstance(value, int) and not -_INTEGER_MAX <= value < _INTEGER_MAX:
-            raise ValueError(f"{key}: a whole number beyond 64 bits")
+            raise ValueError(f"{key}: the whole number does not fit into 64 bits")
 
 
 def line_of(text: str, where: Sequence[str | int]) -> int | None:
-    """Return the line of a key, from 1; of its table where the key is missing, None where that is missing too.
+    """Return the line of a key, from 1; if the key is missing, the line of its table; None if that is missing too.
 
     Args:
-        text: a TOML document whose tables have a line of their own each: `[name]` and `[[name]]`.
+        text: a TOML document in which each header, `[name]` or `[[name]]`, is on a line of its own.
         where: names of tables and keys; a number after the name of an array counts its tables from 1.
     """
     if not where:

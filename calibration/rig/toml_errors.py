@@ -1,4 +1,4 @@
-"""Errors of pydantic in the words of whoever writes TOML: texts in quotes, lists in brackets, tables."""
+"""Errors of pydantic translated to the terms of TOML: texts in quotes, lists in brackets, tables."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ _WHOLE, _NUMBER, _BOOL, _TABLE = (
     "must be a whole number",
     "must be a number",
     "must be true or false",
-    "must be a table: its keys under a header in square brackets, or in braces",
+    "must be a table, with its keys below a header in square brackets or in braces",
 )
-_TABLES = "must be tables: [[KEY]] above the keys of each"
+_TABLES = "must be tables, each below a header [[KEY]]"
 _LIST = "must be a list, in square brackets"
 _LISTS = frozenset({"tuple_type", "list_type"})
 
-# What pydantic calls an error -> what the value must be, by what it tells with it.
+# pydantic's type of an error -> function that makes the message from the error's context.
 _WORDS: Mapping[str, Callable[[Mapping[str, Any]], str]] = MappingProxyType(
     {
         "string_type": lambda _: "must be a text in quotes",
         "string_too_short": lambda _: "must not be empty",
-        "string_pattern_mismatch": lambda _: "must be letters, digits and _, and begin with a letter",
+        "string_pattern_mismatch": lambda _: "must consist of letters, digits and _, and begin with a letter",
         "path_type": lambda _: "must be a path, a text in quotes",
         "int_type": lambda _: _WHOLE,
         "int_parsing": lambda _: _WHOLE,
@@ -41,11 +41,11 @@ _WORDS: Mapping[str, Callable[[Mapping[str, Any]], str]] = MappingProxyType(
         "less_than": lambda told: f"must be below {told['lt']:.15g}",
         "less_than_equal": lambda told: f"must be {told['le']:.15g} or less",
         "literal_error": lambda told: f"must be {told['expected']}",
-        "too_short": lambda told: f"must have at least {told['min_length']}, and has {told['actual_length']}",
-        "too_long": lambda told: f"must have at most {told['max_length']}",
+        "too_short": lambda told: f"must have {told['min_length']} or more entries, but has {told['actual_length']}",
+        "too_long": lambda told: f"must have at most {told['max_length']} entries",
         "dict_type": lambda _: _TABLE,
         "model_type": lambda _: _TABLE,
-        "union_tag_not_found": lambda told: f"lacks the key {told['discriminator']}, which says what it is",
+        "union_tag_not_found": lambda told: f"lacks the key {told['discriminator']}, which selects its kind",
         "union_tag_invalid": lambda told: (
             f"{told['discriminator']} must be one of {told['expected_tags']}, not {told['tag']!r:.80}"
         ),
@@ -54,16 +54,16 @@ _WORDS: Mapping[str, Callable[[Mapping[str, Any]], str]] = MappingProxyType(
 
 
 def place(error: ErrorDetails) -> tuple[str | int, ...]:
-    """Return the key that an error is about, entries of lists counted from 1."""
+    """Return the key that an error is about, as a path; entries of lists are counted from 1."""
     return tuple(part + 1 if isinstance(part, int) else part for part in error["loc"] if part != "[key]")
 
 
 def reason(error: ErrorDetails, model: type[BaseModel]) -> str:
-    """Return what is wrong with a value, a clause that follows its key.
+    """Return the fault of a value, as a clause that follows its key.
 
     Args:
-        error: any but that a key is missing or unknown.
-        model: what the document was read as.
+        error: any error except a missing or an unknown key.
+        model: the model that validated the document.
     """
     kind = error["type"]
     if kind in _LISTS:
@@ -72,12 +72,12 @@ def reason(error: ErrorDetails, model: type[BaseModel]) -> str:
         return _TABLES.replace("KEY", str(key)) if field and any(_models(field.annotation)) else _LIST
     if kind in _WORDS:
         said = _WORDS[kind](error.get("ctx", {}))
-        return f"is no key here: it {said}" if "[key]" in error["loc"] else said
+        return f"is not a valid key: it {said}" if "[key]" in error["loc"] else said
     return error["msg"].removeprefix("Value error, ")
 
 
 def as_toml(value: object) -> str:
-    """Return a value as a TOML file has it, a long one in part; of lists and tables what they are."""
+    """Return a value as written in TOML, a long string shortened; "a list" or "a table" for these."""
     if isinstance(value, list | dict):
         return "a list" if isinstance(value, list) else "a table"
     if isinstance(value, bool):
@@ -86,7 +86,12 @@ def as_toml(value: object) -> str:
 
 
 def section_at(model: type[BaseModel], where: Sequence[str | int]) -> type[BaseModel]:
-    """Return the section of a model that a place leads to; where it leads into none, the last on its way."""
+    """Return the section of a model at a place; if the place is not a section, the innermost section around it.
+
+    Args:
+        model: the model of the whole document.
+        where: names of keys and positions in lists, from the document inwards.
+    """
     for part in where:
         field = _fields(model).get(str(part))
         model = next(_models(field.annotation), model) if field else model
@@ -99,7 +104,7 @@ def _fields(model: type[BaseModel]) -> dict[str, Any]:
 
 
 def _models(annotation: object) -> Iterator[type[BaseModel]]:
-    """Yield the sections that a value may be, or hold."""
+    """Yield the sections that a value of this type may be or contain."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         yield annotation
     for inner in get_args(annotation):

@@ -89,10 +89,13 @@ def test_a_rig_that_no_text_describes_is_refused() -> None:
 @pytest.mark.parametrize(
     ("call", "why"),
     [
-        (lambda rig, rows: rigcal.calibrate(rig, rows, prior="zz"), "prior: 'zz' is unknown; there are recalibration"),
+        (
+            lambda rig, rows: rigcal.calibrate(rig, rows, prior="zz"),
+            "prior: 'zz' is unknown; give one of recalibration",
+        ),
         (lambda rig, rows: rigcal.calibrate(rig, rows, residual="zz"), "residual: 'zz' is unknown"),
-        (lambda rig, rows: rigcal.find_gap(rig, rows, families=["zz"]), "families: 'zz' is unknown; there are"),
-        (lambda rig, _: rigcal.plan(rig, 0), "ask for one at least"),
+        (lambda rig, rows: rigcal.find_gap(rig, rows, families=["zz"]), "families: 'zz' is unknown; give one of"),
+        (lambda rig, _: rigcal.plan(rig, 0), "poses is 0; give 1 or more"),
         (lambda rig, _: rigcal.plan(rig, 3, station_mm=[1.0, 2.0]), "three finite numbers"),
         (lambda rig, _: rigcal.plan(rig, 3, station_mm=[1.0, 2.0, float("nan")]), "three finite numbers"),
         (lambda rig, _: rigcal.plan(rig, 3, separate=["zz@q1"]), "separate: 'zz' is unknown"),

@@ -51,13 +51,13 @@ def test_a_session_is_training_data(written: tuple[Path, str]) -> None:
 def test_a_session_that_is_not_there_is_no_empty_frame(written: tuple[Path, str]) -> None:
     path, name = written
     with rigcal.open_store(path) as store:
-        for sessions, why in ((["s9"], "no session 's9'"), (name, "give a list of sessions")):
+        for sessions, why in ((["s9"], "no session 's9'"), (name, "sessions is a string; give a list")):
             with pytest.raises(rigcal.DataError, match=why):
                 store.observations(sessions)
 
 
 def test_what_is_no_store_or_no_library_is_said(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="pandas and polars"):
+    with pytest.raises(ValueError, match="give one of pandas, polars"):
         rigcal.open_store(tmp_path / "rigcal.sqlite", "dask")  # type: ignore[arg-type]
     with pytest.raises(Exception, match="there is no store"):
         rigcal.open_store(tmp_path / "rigcal.sqlite")

@@ -45,8 +45,8 @@ def fill(directory: Path) -> None:
             **{"live": live.id, "live_manifest_sha256": live.manifest_sha256, "is_better": True},
             **{"manifest_sha256": candidate.manifest_sha256, "sessions": ["check4", "check5"], "against": "live"},
             **{"before_mm": 2.31, "after_mm": 1.22, "p": 0.003, "fixes": 40, "standstills": 8},
-            "sentence": "on 40 held-out fixes of 8 standstills its error is 1.22 mm RMS, that of the live model 2.31 "
-            "mm (a gain by chance: p = 0.003): better beyond chance",
+            "sentence": "on 40 held-out fixes of 8 standstills its error is 1.22 mm RMS, compared with 2.31 mm of the "
+            "live model (a gain by chance: p = 0.003): better beyond chance",
         }
         rig.models.note_comparison(str(candidate.path), comparison)
         training = [{"stage": stage, "rms_mm": mm, "mean_mm": mm, "max_mm": mm, "std_mm": mm} for stage, mm in STAGES]

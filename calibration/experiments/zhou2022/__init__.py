@@ -1,1 +1,1 @@
-"""The experiments of the first paper's section 4 (Zhou et al. 2022) on any data of any rig."""
+"""The experiments of section 4 of the first paper (Zhou et al. 2022), for any rig and data."""

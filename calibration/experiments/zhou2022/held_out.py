@@ -1,4 +1,4 @@
-"""Held-out errors: against the number of training poses, and along one path of the tip (the paper's Fig. 12)."""
+"""Held-out errors as a function of the number of training poses, and along a path of the tip (the paper's Fig. 12)."""
 
 from __future__ import annotations
 
@@ -27,18 +27,18 @@ _HALVINGS = 4
 DRAWS = 4
 
 POINTS = 200
-PAPER = {"rbfn": (41.5, 33.5), "lightgbm": (41.0, 28.5), "chain": (30.5, 17.4)}  # mean and std of 200 points, mm
+PAPER = {"rbfn": (41.5, 33.5), "lightgbm": (41.0, 28.5), "chain": (30.5, 17.4)}  # mean and std over 200 points, mm
 LEARNERS: tuple[Kind, ...] = tuple(kind for kind in get_args(Kind) if kind in PAPER)
 
 
 @dataclass(frozen=True)
 class LearningPoint:
-    """Held-out error after training on so many poses.
+    """Held-out error after training on a number of poses.
 
     Attributes:
-        poses: how many, drawn at random.
+        poses: number of poses, drawn at random.
         geometric_mm, hybrid_mm: RMS error of each draw on the held-out rows.
-        refused: draws from which the calibration refused to make a model.
+        refused: number of draws for which the calibration failed with an error.
     """
 
     poses: int
@@ -47,7 +47,7 @@ class LearningPoint:
     refused: int
 
     def as_dict(self) -> dict[str, object]:
-        """Return a JSON object of the attributes; None where every draw was refused."""
+        """Return a JSON object of the attributes; errors are None if every draw was refused."""
 
         def summary(values: Sequence[float]) -> dict[str, float | None]:
             if not values:
@@ -80,11 +80,11 @@ def learning_curve(
         rig: the rig description.
         rig_text: the TOML that it was read from.
         training: rows to draw from.
-        held_out: rows to judge by, always the same.
+        held_out: rows to evaluate on, the same for all draws.
         whole: the model of all training rows.
-        prior: as `calibrate`.
+        prior: as for `calibrate`.
         run: seed of the draws and the calibrations, workers and progress.
-        draws: how many of each size.
+        draws: number of draws of each size.
     """
     _, pose = np.unique(standstills(training), return_inverse=True)
     poses = int(pose.max()) + 1
@@ -107,7 +107,7 @@ def learning_curve(
 
 
 def _held_out(model: CalibratedModel, held_out: Observations) -> tuple[float, float]:
-    """RMS error of stages geometric and hybrid, mm."""
+    """Return the RMS errors of the stages geometric and hybrid, mm."""
 
     def rms(position_mm: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> float:
         return math.sqrt(float(((held_out.position_mm - position_mm) ** 2).sum(axis=1).mean()))
@@ -124,11 +124,11 @@ class Trajectory:
     """Errors along the first held-out fixes of one prism, in the order of time.
 
     Attributes:
-        prism: whose path it is.
-        rows: (m,) of the held-out data.
-        in_time: False where the data have no times, and the rows are taken in their own order.
-        error_mm: what was predicted with -> (m,) size of the error.
-        left_out: learner -> why it was not taken and its errors are those of the kinematics.
+        prism: the prism whose path it is.
+        rows: (m,) indices of rows of the held-out data.
+        in_time: False if the data have no times; the rows then keep their own order.
+        error_mm: stage or learner -> (m,) size of the error.
+        left_out: learner -> the reason why it was left out; its errors are then those of the kinematics.
     """
 
     prism: str
@@ -152,14 +152,14 @@ class Trajectory:
 
 
 def tip_path(rig: Rig, held_out: Observations, distance_mm: Floats) -> tuple[str, Integers, bool]:
-    """The tip's prism, its first 200 rows, and whether times put them in order.
+    """Return the tip's prism, the indices of its first 200 rows, and whether they are ordered by time.
 
-    The tip is the farthest from the base, on average, of the prisms at the last frame that was measured.
+    The tip is, of the prisms at the last measured frame, the one farthest from the base on average.
 
     Args:
         rig: the rig description.
         held_out: n rows.
-        distance_mm: (n,) of each from the base.
+        distance_mm: (n,) distance of each row from the base.
     """
     measured = np.unique(held_out.prism).tolist()
     last = max(rig.prism(name).frame for name in measured)
@@ -180,12 +180,12 @@ def trajectory(
     held_out: Observations,
     run: Run,
 ) -> Trajectory:
-    """Errors along the tip's path.
+    """Compute the errors along the tip's path.
 
     Args:
-        model: with effects and residual, as `calibrate` makes it.
-        bare: the same kinematics without effects or residual; gets each of the paper's learners in turn.
-        training: rows that both were fitted to.
+        model: model with effects and residual, as `calibrate` returns it.
+        bare: the same kinematics without effects or residual; each of the paper's learners is trained on it.
+        training: rows that both models were fitted to.
         held_out: rows of the same set-ups.
         run: seed of the learners, workers and progress.
     """
@@ -214,7 +214,10 @@ def trajectory(
 
 
 def standstills(observations: Observations) -> Integers:
-    """(n,) number of the standstill of every row: those of one session, set-up and pose, or else a row by itself."""
+    """Return (n,) the standstill number of every row: equal for rows of one session, set-up and pose.
+
+    A row without a pose is a standstill of its own.
+    """
     seen: dict[tuple[str, str, str], int] = {}
     numbers = np.empty(len(observations), dtype=np.intp)
     labels = zip(observations.session.tolist(), observations.setup.tolist(), observations.pose.tolist(), strict=True)

@@ -1,4 +1,4 @@
-"""The whole of section 4: errors before, Table 3, the front of the weights, the learning curve, the trajectory."""
+"""The whole of section 4: errors before calibration, Table 3, Pareto front of weights, learning curve, trajectory."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from calibration.published.paper_evolution import PaperSettings
 from calibration.rig.description import Rig
 from calibration.run_settings import DEFAULT_RUN, Run
 
-# Mean absolute errors in mm that the paper reports of its own machine.
+# Mean absolute errors in mm that the paper reports for its own machine.
 PAPER_BEFORE: Mapping[str, Mapping[str, float]] = {
     "single-joint": {"r": 323.59, "s": 477.53, "b": 895.52, "w": 930.88},
     "multi-joint": {"r": 355.61, "s": 783.17, "b": 1085.32, "w": 1288.92},
@@ -41,11 +41,11 @@ PAPER_BEFORE: Mapping[str, Mapping[str, float]] = {
 
 @dataclass(frozen=True)
 class Before:
-    """The nominal model on the training rows of one kind of motion.
+    """Errors of the nominal model on the training rows of one kind of motion.
 
     Attributes:
         motion: `single-joint` or `multi-joint`.
-        fixes: prism -> how many.
+        fixes: prism -> number of fixes.
         mean_mm: prism -> mean error.
     """
 
@@ -56,18 +56,18 @@ class Before:
 
 @dataclass(frozen=True)
 class Protocol:
-    """Results of the protocol: what section 4 of the paper shows.
+    """Results of the protocol, as in section 4 of the paper.
 
     Attributes:
-        rig: name.
-        training, held_out: how many rows.
-        before: of the training rows.
+        rig: name of the rig.
+        training, held_out: numbers of rows.
+        before: errors of the nominal model on the training rows.
         held_out_before_mm: prism -> mean error of the nominal model on the held-out rows.
-        identified: Table 3.
-        front: of the weights; None where one prism alone was measured.
-        learning: from few poses to all.
-        trajectory: along the tip's path.
-        warnings: about data and fit, and what could not be done and why.
+        identified: lines of Table 3.
+        front: Pareto front of the weights; None if only one prism was measured.
+        learning: learning curve, from few poses to all.
+        trajectory: errors along the tip's path.
+        warnings: warnings about data and fit, and parts that were not possible with the reason.
     """
 
     rig: str
@@ -82,7 +82,7 @@ class Protocol:
     warnings: tuple[str, ...]
 
     def as_dict(self) -> dict[str, object]:
-        """Return the results as a JSON object, beside the paper's own figures."""
+        """Return the results as a JSON object, together with the paper's own figures."""
         front = None
         if self.front is not None:
             points = [
@@ -123,25 +123,25 @@ def run_protocol(
     draws: int = DRAWS,
     run: Run = DEFAULT_RUN,
 ) -> Protocol:
-    """Do everything of section 4 with these data.
+    """Repeat all experiments of section 4 with the given data.
 
     Args:
         rig: the rig description.
         rig_text: the TOML that it was read from.
         training: rows to fit, of single-joint and of multi-joint motion.
-        held_out: rows of the same set-ups that nothing is fitted to; the first 200 of the tip are the trajectory.
-        clock: monotonic seconds.
-        prior: trust the build tolerances, or estimate their scale; also how wide the bounds of Table 3 are.
-        time_limit_s: ends each of the paper's searches.
-        settings: of the paper's search; the paper's by default.
-        draws: of each size in the learning curve.
+        held_out: rows of the same set-ups that are not used in any fit; the first 200 of the tip are the trajectory.
+        clock: function that returns monotonic seconds.
+        prior: trust the build tolerances, or estimate their scale; also determines the width of the bounds of Table 3.
+        time_limit_s: time limit of each of the paper's searches.
+        settings: settings of the paper's search; the paper's own by default.
+        draws: number of random draws for each size of the learning curve.
         run: seed, workers and progress.
 
     Raises:
         DataError: rows without positions, prisms that the rig lacks.
-        UnsafeError: as `pipeline.calibrate` refuses the training rows, or a set-up that they lack.
+        UnsafeError: as for the training rows in `pipeline.calibrate`, or the training rows lack a held-out set-up.
     """
-    # BLAS threads under the search's own would wait for each other.
+    # BLAS threads within the threads of the search would wait for each other.
     with threadpool_limits(1, user_api="blas"):
         alone = run.quiet()
         for observations in (training, held_out):
@@ -156,12 +156,12 @@ def run_protocol(
         table = Table3.prepare(rig, training, held_out, single, prior)
         front = table.front(run.part(0.1, 0.2))
         if front is None:
-            warnings.append("one prism alone was measured: there are no goals to weigh against each other")
+            warnings.append("only one prism was measured: there are no objectives to weight")
         identified: list[Identified] = []
         lines = table.data_sets(front)
         for number, (data, rows, weight) in enumerate(lines):
             if not table.enough(rows):
-                warnings.append(f"Table 3 without {data} data: {int(rows.sum())} different fixes are too few")
+                warnings.append(f"Table 3 has no line of {data} data: {int(rows.sum())} different fixes are too few")
                 continue
             begin, end = (0.2 + 0.4 * done / len(lines) for done in (number, number + 1))
             identified += table.identify(
@@ -174,7 +174,7 @@ def run_protocol(
                 time_limit_s=time_limit_s,
             )
         if not all(line.complete for line in identified):
-            warnings.append("the paper's search was stopped at the time limit; its lines are the best until then")
+            warnings.append("the paper's search stopped at the time limit; its lines are the best found until then")
 
         learning = learning_curve(
             rig,
@@ -216,10 +216,10 @@ def _before(model: CalibratedModel, training: Observations, single: Flags) -> tu
 
 def _missing_motion(single: Flags) -> list[str]:
     if not single.any():
-        return ["the training rows hold no single-joint sweep: its columns and lines are left out"]
+        return ["the training rows contain no single-joint sweep: its columns and lines are left out"]
     if single.all():
         return [
-            "the training rows are all of single-joint sweeps: the columns and lines of multi-joint data are left out"
+            "all training rows belong to single-joint sweeps: the columns and lines of multi-joint data are left out"
         ]
     return []
 
@@ -227,18 +227,22 @@ def _missing_motion(single: Flags) -> list[str]:
 def _doubts_of_path(path: Trajectory) -> list[str]:
     found = []
     if len(path.rows) < POINTS:
-        found.append(f"the trajectory has {len(path.rows)} points and not {POINTS}: prism {path.prism!r} has no more")
+        found.append(f"the trajectory has {len(path.rows)} points, not {POINTS}: prism {path.prism!r} has no more")
     if not path.in_time:
-        found.append("the held-out rows have no time_s: the trajectory is in the order of its rows")
+        found.append("the held-out rows have no time_s: the trajectory is in the order of the rows")
     return found
 
 
 def single_joint_rows(rig: Rig, observations: Observations) -> Flags:
-    """(n,) which rows were measured while one joint alone was moved from stop to stop.
+    """Return an (n,) mask of rows measured while only one joint was moved from stop to stop.
 
-    A row does if there is a joint for which at least five different readings, its own among them, were taken at its
-    set-up while every other joint stood still. That is of all joints, and of every row's own neighbours: the sweeps of
-    `find_axes` ask for those alone that move the prism, and share no row.
+    A row counts if there is a joint with at least five different readings, including that of the row, at its set-up
+    while all other joints stood still. Unlike the sweeps of `find_axes`, which compare only the joints that move the
+    prism and share no rows, this test compares all joints, and each row with its own neighbours.
+
+    Args:
+        rig: the rig description.
+        observations: n rows.
     """
     found = np.zeros(len(observations), dtype=bool)
     scaled = np.column_stack([observations.joints[name] for name in rig.joint_names]) / standing_spread(rig)

@@ -1,10 +1,10 @@
-"""Table 3: which data and which weights identify the rows' constants best, by the paper's search and converged.
+"""Table 3: the data and weights that identify the rows' constants best, by the paper's search and by a converged fit.
 
-The paper's values may be where a search was stopped and no physics, so the very same objective, unknowns and bounds are
-solved twice. As in the paper, base and unknown prism offsets are known beforehand: they stay where the nominal model
-puts them. As in its Eq. 19, the four positions are weighed alone, without the attitude that `first_paper` adds where
-two prisms of one frame give it. What holding the base costs where the drawings are far off shows a third solution,
-which searches base and offsets along.
+The paper's values may depend on where its search stopped rather than on physics. The same objective, unknowns and
+bounds are therefore solved twice: by the paper's search and to convergence. As in the paper, base and unknown prism
+offsets are assumed known: they keep the values of the nominal model. As in Eq. 19 of the paper, only the four
+positions are weighted, without the attitude that `first_paper` adds if two prisms of one frame determine it. A third
+solution also searches base and offsets. It shows the cost of a fixed base if the nominal values are far off.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ Flags = NDArray[np.bool_]
 DataSet = Literal["single-joint", "multi-joint", "weighted"]
 Way = Literal["paper", "converged", "base free"]
 
-# Mean absolute errors in mm that the paper reports of its own machine.
+# Mean absolute errors in mm that the paper reports for its own machine.
 PAPER_AFTER: Mapping[DataSet, Mapping[str, float]] = {
     "single-joint": {"r": 382.58, "s": 396.04, "b": 466.92, "w": 263.21},
     "multi-joint": {"r": 389.08, "s": 334.58, "b": 290.45, "w": 44.83},
     "weighted": {"r": 306.82, "s": 320.12, "b": 298.69, "w": 70.37},
 }
-_FOLDS = 3  # one of which judges the weights
+_FOLDS = 3  # one of them evaluates the weights
 _AT_BOUND = 0.999
 
 
@@ -47,14 +47,14 @@ class Identified:
     """One line of the table.
 
     Attributes:
-        data: which training rows.
-        way: the paper's search, the converged optimum, or that with base and unknown prism offsets free as well.
+        data: the training rows that were used.
+        way: the paper's search, the converged optimum, or the optimum with free base and unknown prism offsets.
         weight: mu of every prism.
-        fixes: how many different fixes were fitted.
-        objective_mm2: Eq. 19 on them.
+        fixes: number of different fixes that were fitted.
+        objective_mm2: value of Eq. 19 on these fixes.
         held_out_mm: prism -> mean error on the held-out rows.
-        at_bounds: parameters that ended at the edge of where they may go.
-        seconds: how long it took.
+        at_bounds: number of parameters that ended at their bounds.
+        seconds: duration.
         complete: False if the search was stopped before its end.
     """
 
@@ -69,7 +69,7 @@ class Identified:
     complete: bool
 
     def as_dict(self) -> dict[str, object]:
-        """Return a JSON object of what was identified."""
+        """Return a JSON object of the line."""
         return {
             "data": self.data,
             "search": self.way,
@@ -88,9 +88,9 @@ class Table3:
     """Table 3's data, bound to one chain.
 
     Attributes:
-        samples: training rows, repeats averaged.
-        training, held_out: the objective on either.
-        single: (m,) samples of single-joint motion.
+        samples: training rows, with repeats averaged.
+        training, held_out: the objective on the training and on the held-out rows.
+        single: (m,) mask of samples of single-joint motion.
     """
 
     samples: Samples
@@ -100,17 +100,17 @@ class Table3:
 
     @classmethod
     def prepare(cls, rig: Rig, training: Observations, held_out: Observations, single: Flags, prior: Prior) -> Table3:
-        """Place the base with the nominal model, and bound the rows' constants as the prior says.
+        """Place the base with the nominal model, and set the bounds of the rows' constants.
 
         Args:
             rig: the rig description.
             training: n rows.
             held_out: rows of the same set-ups.
-            single: (n,) rows of single-joint motion.
-            prior: how wide the bounds are.
+            single: (n,) mask of rows of single-joint motion.
+            prior: determines the width of the bounds.
 
         Raises:
-            DataError, UnsafeError: as `solve.place`.
+            DataError, UnsafeError: as for `solve.place`.
         """
         chain, samples, start = place(rig, training)
         nominal = refine(chain, samples, start.x, free=np.isinf(chain.prior_sigma))
@@ -123,14 +123,20 @@ class Table3:
         return cls(samples, fitted, judged, swept)
 
     def front(self, run: Run) -> Front | None:
-        """The Pareto front: two thirds of the training poses are fitted, the others judge; None with one prism."""
+        """Return the Pareto front, fitted on two thirds of the training poses and evaluated on the others.
+
+        With fewer than two prisms, return None.
+        """
         if len(self.training.prisms) < 2:
             return None
         fold = folds(np.char.add("pose ", self._pose), _FOLDS, run.seed)
         return pareto_front(self.training.select(fold != 0), self.training.select(fold == 0), run)
 
     def data_sets(self, front: Front | None) -> list[tuple[DataSet, Flags, dict[str, float]]]:
-        """Name, samples and weights of every line; the weighted line has all samples and the front's weights."""
+        """Return name, mask of samples, and weights of every line.
+
+        The weighted line has all samples and the weights of the front.
+        """
         equal = dict.fromkeys(self.training.prisms, 1.0 / len(self.training.prisms))
         sets: list[tuple[DataSet, Flags, dict[str, float]]] = []
         if self.single.any():
@@ -142,7 +148,7 @@ class Table3:
         return sets
 
     def enough(self, rows: Flags) -> bool:
-        """True if there are as many coordinates as unknowns."""
+        """Return True if there are at least as many coordinates as unknowns."""
         return 3 * int(rows.sum()) >= int(self.training.free.sum())
 
     def identify(
@@ -156,16 +162,16 @@ class Table3:
         settings: PaperSettings | None,
         time_limit_s: float | None,
     ) -> tuple[Identified, ...]:
-        """The lines of the paper's search, of the converged optimum, and of the one with the base free.
+        """Return the lines of the paper's search, of the converged optimum, and of the optimum with a free base.
 
         Args:
             data: name of one of `data_sets`.
-            rows: its samples.
+            rows: (m,) mask of its samples.
             weight: its weights.
-            run: of the search.
-            settings: of the search.
-            clock: monotonic seconds.
-            time_limit_s: ends the search.
+            run: seed, workers and progress of the search.
+            settings: settings of the search.
+            clock: function that returns monotonic seconds.
+            time_limit_s: time limit of the search.
         """
         part = self.training.select(rows)
         given = {name: mu for name, mu in weight.items() if name in part.prisms}
@@ -204,7 +210,11 @@ class Table3:
         )
 
     def held_out_mean_mm(self, values: Floats | None = None) -> dict[str, float]:
-        """Prism -> mean error on the held-out rows with all parameters (p,); of the nominal model by default."""
+        """Return prism -> mean error on the held-out rows.
+
+        Args:
+            values: (p,) all parameters; those of the nominal model by default.
+        """
         judged = self.held_out
         position = judged.chain.positions_mm(judged.at if values is None else values, judged.data)
         error, prism = np.linalg.norm(judged.position_mm - position, axis=1), judged.data.prism
@@ -213,6 +223,6 @@ class Table3:
 
     @property
     def _pose(self) -> np.ndarray[tuple[int, ...], np.dtype[np.str_]]:
-        """(m,) label of each sample's standstill."""
+        """(m,) labels of the samples' standstills."""
         standstill = self.samples.standstill
         return np.asarray(np.arange(len(self.samples)) if standstill is None else standstill).astype(np.str_)

@@ -1,6 +1,7 @@
-"""The paper's weighted objective (Eq. 19) converged, and the Pareto front of its four weights.
+"""Convergent minimisation of the paper's weighted objective (Eq. 19), and the Pareto front of its four weights.
 
-Same unknowns and bounds as the paper's search. The front shows which errors of the prisms can be had together.
+Unknowns and bounds are those of the paper's search. The front shows the errors of the prisms that are possible
+together.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from calibration.run_settings import Run
 
 _SETTLED = 1e-9  # relative change of the objective
 _ROUNDS = 200
-_INSIDE = 0.999  # of the bounds: where a start may be
+_INSIDE = 0.999  # of the bounds: starting values are clipped to this
 
 _MOST_POINTS = 150
 _MOST_PARTS = 24
@@ -30,15 +31,15 @@ _LEAST_WEIGHT = 0.01
 
 @dataclass(frozen=True, eq=False)
 class WeightedSquares:
-    """F = sum over prisms of mu_p e_p^2 / n_p on one data set.
+    """The objective F = sum over prisms of mu_p e_p^2 / n_p on one data set.
 
     Attributes:
         chain: kinematics.
         data: (n) bound observations.
         position_mm: (n, 3) measured positions.
-        free: (p,) parameters that are searched.
-        at: (p,) values of the others.
-        width: (k,) bounds of the k free ones, from -width to width; `at` is within.
+        free: (p,) mask of the parameters that are searched.
+        at: (p,) values of the other parameters.
+        width: (k,) the k free parameters are bounded by -width and width; `at` is within these bounds.
     """
 
     chain: Chain
@@ -54,13 +55,13 @@ class WeightedSquares:
         return tuple(self.chain.rig.prism_names[i] for i in np.unique(self.data.prism))
 
     def select(self, rows: NDArray[np.bool_] | NDArray[np.intp]) -> WeightedSquares:
-        """The objective on the given rows."""
+        """Return the objective on the given rows."""
         return WeightedSquares(
             self.chain, self.data.select(rows), self.position_mm[rows], self.free, self.at, self.width
         )
 
     def with_base(self) -> WeightedSquares:
-        """Return the objective that also searches base and unknown prism offsets, as far as 1 m or 1 rad."""
+        """Return the objective that also searches base and unknown prism offsets, up to 1 m or 1 rad beyond `at`."""
         flat = np.isinf(self.chain.prior_sigma)
         width = np.array([FLAT_MM if p.unit == "mm" else FLAT_RAD for p in self.chain.parameters]) + np.abs(self.at)
         width[self.free] = self.width
@@ -68,24 +69,28 @@ class WeightedSquares:
         return WeightedSquares(self.chain, self.data, self.position_mm, free, self.at, width[free])
 
     def values(self, found: Floats) -> Floats:
-        """(p,) all parameters, from the k free ones."""
+        """Return (p,) all parameters, given the (k,) free ones."""
         values = self.at.copy()
         values[self.free] = found
         return values
 
     def error_mm(self, found: Floats) -> Floats:
-        """(n,) size of the error of every row."""
+        """Return (n,) the size of the error of every row, given the (k,) free parameters."""
         position = self.chain.positions_mm(self.values(found), self.data)
         return np.asarray(np.linalg.norm(self.position_mm - position, axis=1))
 
     def cost(self, weight: Mapping[str, float], found: Floats) -> float:
-        """F, mm^2."""
+        """Return F, mm^2, given the weights and the (k,) free parameters."""
         return float(((self._scale(weight) * self.error_mm(found)) ** 2).sum())
 
     def optimum(self, weight: Mapping[str, float], start: Floats | None = None) -> Floats:
-        """(k,) where F is least within the bounds: a trust region from `start`, by default from `at`.
+        """Return the (k,) free parameters that minimise F within the bounds, by a trust-region method.
 
-        Where the data leave directions open, the result keeps to the start in them.
+        In directions that the data do not determine, the result stays at the start.
+
+        Args:
+            weight: mu of the prisms.
+            start: (k,) starting values; those of `at` by default.
         """
         scale = np.repeat(self._scale(weight), 3)
         position_mm, data = self.position_mm, self.data
@@ -118,7 +123,7 @@ class WeightedSquares:
         return found
 
     def _scale(self, weight: Mapping[str, float]) -> Floats:
-        """(n,) square roots of mu_p / n_p."""
+        """Return (n,) square roots of mu_p / n_p."""
         scale = np.zeros(len(self.data))
         for name, mu in weight.items():
             own = self.data.prism == self.chain.rig.prism_names.index(name)
@@ -134,7 +139,7 @@ class WeightPoint:
     Attributes:
         weight: mu of every prism; their sum is 1.
         rms_mm: RMS error of every prism on poses that were not fitted.
-        dominated: another point is better at one prism and worse at none.
+        dominated: True if another point is better for one prism and not worse for any.
     """
 
     weight: dict[str, float]
@@ -144,12 +149,12 @@ class WeightPoint:
 
 @dataclass(frozen=True)
 class Front:
-    """Errors of the prisms at every point of a grid of weights, and the point that is taken.
+    """Errors of the prisms at every point of a grid of weights, and the chosen point.
 
     Attributes:
-        points: of the grid of weights.
-        chosen: number of the point of the front that is nearest to the best error of every prism, each counted in
-            units of that best.
+        points: points of the grid of weights.
+        chosen: index of the point of the front that is nearest to the best errors of all prisms; each error is measured
+            in units of the best error of its prism.
     """
 
     points: tuple[WeightPoint, ...]
@@ -162,12 +167,12 @@ class Front:
 
 
 def pareto_front(fitted: WeightedSquares, judged: WeightedSquares, run: Run) -> Front:
-    """Optima over a grid of weights, each started from its neighbour's.
+    """Compute the optima over a grid of weights, each started from the optimum of its neighbour.
 
     Args:
         fitted: the objective on the poses that are fitted.
-        judged: the same on others, whose errors place the points.
-        run: told its progress.
+        judged: the objective on other poses, which give the errors of the points.
+        run: receives the progress.
     """
     prisms = [name for name in fitted.prisms if name in judged.prisms]
     weights = list(weight_grid(len(prisms)))
@@ -189,9 +194,9 @@ def pareto_front(fitted: WeightedSquares, judged: WeightedSquares, run: Run) -> 
 
 
 def weight_grid(count: int) -> Iterator[tuple[float, ...]]:
-    """Weights of `count` prisms, at most 150 sets: an even grid of the simplex, no weight below 0.01.
+    """Yield weights of `count` prisms, at most 150 sets: a uniform grid of the simplex, with no weight below 0.01.
 
-    Neighbours follow each other, so that one's optimum is a good start for the next.
+    Successive sets are neighbours, so that the optimum of one is a good start for the next.
     """
     parts = max(p for p in range(1, _MOST_PARTS + 1) if math.comb(p + count - 1, count - 1) <= _MOST_POINTS or p == 1)
     spare = 1.0 - count * _LEAST_WEIGHT
@@ -201,6 +206,10 @@ def weight_grid(count: int) -> Iterator[tuple[float, ...]]:
 
 
 def dominated(errors: Floats | Sequence[Sequence[float]]) -> NDArray[np.bool_]:
-    """(m,) which rows of (m, goals) have another row that is nowhere greater and somewhere smaller."""
+    """Return an (m,) mask of dominated rows: another row is nowhere greater and somewhere smaller.
+
+    Args:
+        errors: (m, objectives).
+    """
     table = np.asarray(errors, dtype=np.float64)
     return np.array([bool(((table <= own).all(axis=1) & (table < own).any(axis=1)).any()) for own in table])

@@ -1,4 +1,4 @@
-"""Export formats, one a file: every module of this folder with a `FORMAT` is found by its being here."""
+"""Export formats, one per file: every module in this folder defines a `FORMAT` and is found automatically."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def formats() -> Mapping[str, Format]:
 
 
 def chosen_formats(names: Sequence[str] = ()) -> tuple[Format, ...]:
-    """Return the formats of these names, or those that are written when none is asked for.
+    """Return the formats of these names; without names, the default formats.
 
     Raises:
         DataError: an unknown format.
@@ -29,7 +29,7 @@ def chosen_formats(names: Sequence[str] = ()) -> tuple[Format, ...]:
     found = formats()
     unknown = next((name for name in names if name not in found), None)
     if unknown is not None:
-        raise DataError("format", f"{unknown!r} is unknown; there are {', '.join(found)}")
+        raise DataError("format", f"{unknown!r} is unknown; give one of {', '.join(found)}")
     return tuple(made for made in found.values() if (made.name in names if names else made.is_default))
 
 
@@ -37,14 +37,14 @@ def export_files(export: Export, names: Sequence[str] = ()) -> dict[str, bytes]:
     """Make the files of an export.
 
     Args:
-        export: the model and what is asked.
-        names: of formats; those that are written by default when empty.
+        export: the model and the options of its export.
+        names: names of formats; if empty, the default formats are written.
 
     Returns:
         File name -> content.
 
     Raises:
-        DataError: an unknown format; a prism that the rig lacks, too few poses, a joint trained beyond its limits, or a
-            library that the format needs and that is not installed.
+        DataError: an unknown format, a prism that the rig lacks, too few poses, a joint trained only beyond its limits,
+            or a library that the format needs and that is not installed.
     """
     return {made.file: made.content(export) for made in chosen_formats(names)}

@@ -1,6 +1,6 @@
 """rigcal_model.h: forward kinematics with effects, and the inverse, as C99 for a controller.
 
-It needs no library but the standard one. The learned residual is left out
+The code needs only the standard library. The learned residual is left out
 (docs/decisions/0032-models-for-other-tools.md).
 """
 
@@ -27,9 +27,10 @@ from calibration.rig.description import Rig
 _ENGINE = "engine.h"
 _SLOT = "/*EFFECTS*/"
 _USE = """\
-   Call rigcal_forward(q, in, places) for the prisms' places in the base frame, mm, at the readings q of the joints, and
-   rigcal_inverse(count, prism, target, in, q) for the commands that bring prisms to targets. C99, no memory is taken,
-   nothing is kept between calls: any number of threads may call. Joints, in the order of q:
+   Call rigcal_forward(q, in, places) for the positions of the prisms in the base frame, mm, at the joint readings q,
+   and rigcal_inverse(count, prism, target, in, q) for the commands that bring prisms to targets. The code is C99. It
+   allocates no memory and keeps no state between calls, so any number of threads may call it.
+   Joints, in the order of q:
 """
 
 
@@ -52,11 +53,11 @@ def _with_effects(engine: str, code: EffectCode) -> str:
 
 def _inputs(code: EffectCode) -> str:
     fields = {
-        "direction": "    double direction[RIGCAL_JOINTS]; /* last direction of motion: -1, 1, or 0 for not known */\n",
-        "temperature_degC": "    double temperature_degC;          /* of the machine; NAN for not known */\n",
+        "direction": "    double direction[RIGCAL_JOINTS]; /* last direction of motion: -1, 1, or 0 if not known */\n",
+        "temperature_degC": "    double temperature_degC;          /* of the machine; NAN if not known */\n",
     }
     used = "".join(text for name, text in fields.items() if name in code.inputs)
-    nothing = "    int unused; /* this model needs nothing beside the joints */\n"
+    nothing = "    int unused; /* this model needs only the joint readings */\n"
     return f"typedef struct {{\n{used or nothing}}} rigcal_inputs;\n\n"
 
 
@@ -97,7 +98,7 @@ def _tables(rig: Rig, tree: Carriers, down: Floats, code: EffectCode) -> Iterabl
 
 
 def _holds(rig: Rig) -> list[list[bool]]:
-    """Return for each frame which prisms it carries."""
+    """Return for each frame and prism whether the frame carries the prism."""
     paths = [(0, *rig.path(prism.frame)) for prism in rig.prisms]
     return [[frame in path for path in paths] for frame in range(len(rig.rows) + 1)]
 
@@ -116,7 +117,7 @@ def _numbers(kind: str, values: Iterable[float]) -> str:
 
 
 def _context(export: Export) -> EffectContext:
-    """Return a pose of the machine as effects see it; the shapes of uncertain loads are of its work volume."""
+    """Return the context of effects at one pose of the machine; the shapes of uncertain loads do not depend on it."""
     model = export.model
     rows = Machine(model, export.setup).rows(model.rig.prism_names[0], np.zeros((1, len(model.rig.joints))))
     return Predictor.of(model).context(rows)
@@ -127,7 +128,7 @@ def _writer(export: Export) -> EffectWriter:
 
 
 def written_effects(export: Export) -> tuple[FittedEffect, ...]:
-    """Return the effects of a model that the header has."""
+    """Return the effects of a model that the header contains."""
     writer = _writer(export)
     moving = [effect for effect in export.model.effects if library()[effect.family].moves_machine]
     return tuple(effect for effect in moving if writer.can_write(effect))
@@ -139,7 +140,7 @@ def _left_out(export: Export) -> LeftOut:
 
 
 def _content(export: Export) -> bytes:
-    """Return the header: comment, sizes, inputs of the caller, tables, and the program with its effects."""
+    """Return the header: comment, sizes, inputs of the caller, tables, and the functions with the effects."""
     writer = _writer(export)
     rig, tree = writer.context.rig, writer.tree
     down = GravityModel(export.model.chain, export.model.values).down[export.setup]
@@ -152,7 +153,7 @@ def _content(export: Export) -> bytes:
     prisms = "".join(f"     {i}  {name}\n" for i, name in enumerate(rig.prism_names))
     told = "\n   ".join(line for remark in remarks for line in remark.split("\n")).replace("*/", "* /")
     head = (
-        f"/* {told}\n\n{_USE}{joints}   Prisms, in the order of the places:\n{prisms}*/\n\n"
+        f"/* {told}\n\n{_USE}{joints}   Prisms, in the order of the positions:\n{prisms}*/\n\n"
         "#ifndef RIGCAL_MODEL_H\n#define RIGCAL_MODEL_H\n\n#include <math.h>\n#include <stddef.h>\n\n"
     )
     return (

@@ -1,4 +1,4 @@
-"""calibration.json: everything that was identified, with units and standard errors; lengths mm, angles rad."""
+"""calibration.json: all identified values with units and standard errors; lengths mm, angles rad."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from calibration.model.model import CalibratedModel
 
 
 def document(model: CalibratedModel) -> dict[str, object]:
-    """Return parameters, bases, effects, accuracy and provenance of a model as JSON can hold them."""
+    """Return parameters, bases, effects, accuracy and provenance of a model as a JSON object."""
     chain = model.chain
     nominal = {op.parameter: op.constant for ops in (*chain.row_ops, *chain.prism_ops) for op in ops}
     try:
@@ -67,7 +67,7 @@ def _content(export: Export) -> bytes:
 
 
 def _left_out(export: Export) -> LeftOut:
-    """Return what stands in it by name alone: the numbers of effects are in it, those of a learned residual are not."""
+    """Return the part that the file only names, the learned residual; the numbers of effects are in the file."""
     return export.without(lambda _: True)
 
 

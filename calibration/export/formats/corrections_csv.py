@@ -1,6 +1,6 @@
-"""corrections.csv: at every node of the grid, each prism's place by the drawings and by the model, in the base frame.
+"""corrections.csv: the nominal and the corrected position of each prism at every node of the grid, in the base frame.
 
-A controller that knows only its own nominal kinematics can interpolate the difference linearly in every joint value.
+A controller that has only its own nominal kinematics can interpolate the difference linearly in every joint value.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ _DECIMALS = 4  # of mm
 
 
 def _content(export: Export) -> bytes:
-    """Prism, joint values, nominal and corrected place, their difference, and 1 where the rig can take the pose."""
+    """Return the CSV: prism, joint values, nominal and corrected position, their difference, 1 for a reachable pose."""
     grid, out = export.grid, io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     places = [f"{axis}_{kind}_mm" for kind in ("nominal", "corrected", "correction") for axis in "xyz"]
@@ -35,7 +35,7 @@ def _content(export: Export) -> bytes:
 FORMAT = Format(
     "grid",
     GRID_FILE,
-    "CSV: at the nodes of a grid of joint values, where each prism is nominally and by the model",
+    "CSV: the nominal and the corrected position of each prism at the nodes of a grid of joint values",
     _content,
     lambda export: export.left_out_of_grid,
     is_default=True,

@@ -1,4 +1,4 @@
-"""dh.csv: the identified constants as a Denavit-Hartenberg table, mm and deg, which `rigcal rig import` reads too."""
+"""dh.csv: the identified constants as a Denavit-Hartenberg table, mm and deg, which `rigcal rig import` can read."""
 
 from __future__ import annotations
 
@@ -14,9 +14,10 @@ from calibration.rig.exchange.from_table import BEFORE, CONSTANTS, DRIVES, JOINT
 
 
 def dh_text(chain: Chain, x: Floats, remarks: Sequence[str]) -> str:
-    """Return a rig at parameters `x` (p,) as a table, mm and deg, with remarks in comments at its head.
+    """Return a rig with parameters `x` (p,) as a table, mm and deg, with remarks as comments at its head.
 
-    A line for each joint, for each row of the kinematic table in the rig file's convention, and for each prism.
+    The table has a line for each joint, for each row of the kinematic table in the rig file's convention, and for each
+    prism.
     """
     rig, out = chain.rig, io.StringIO()
     names = [name for name, _ in ROW_ORDER[rig.convention]]

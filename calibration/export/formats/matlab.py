@@ -14,9 +14,10 @@ from calibration.export.motions import motion_tree
 
 _CHECKS = 20
 _USE = """\
-T{k} = T{parent(k)} * fixed(:,:,k) * motion(k), T{0} = eye(4), counted from 1; motion(k) turns (kind 1) about, or slides
-(kind 2) along, axis(k) (1 x, 2 y, 3 z) by drive(k,:) * q, in rad or mm, with q the readings in deg and mm; kind 0 does
-nothing. The place of prism p is T{prism_motion(p)} * [prism_place(p,:) 1]'. check_prisms has the places at check_q.
+T{k} = T{parent(k)} * fixed(:,:,k) * motion(k), T{0} = eye(4), counted from 1. motion(k) rotates about (kind 1) or
+slides along (kind 2) axis(k) (1 x, 2 y, 3 z) by drive(k,:) * q, in rad or mm, where q are the readings in deg and mm;
+kind 0 is no motion. The position of prism p is T{prism_motion(p)} * [prism_place(p,:) 1]'. check_prisms has the
+positions at check_q.
 """
 
 
@@ -52,7 +53,7 @@ def _content(export: Export) -> bytes:
         "check_prisms": np.stack([kinematics.corrected_mm(name, poses) for name, _ in prisms], axis=2),
     }
     out = io.BytesIO()
-    savemat(cast("Any", out), arrays, do_compression=True)  # takes files too, which its stubs do not say
+    savemat(cast("Any", out), arrays, do_compression=True)  # accepts file objects, unlike its stubs
     return out.getvalue()
 
 

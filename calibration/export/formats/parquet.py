@@ -1,4 +1,4 @@
-"""corrections.parquet: the correction grid of corrections.csv as a Parquet table with its description inside."""
+"""corrections.parquet: the correction grid of corrections.csv as a Parquet table, with a description as metadata."""
 
 from __future__ import annotations
 

@@ -20,37 +20,37 @@ from calibration.rig.exchange.frames import angles_zyx
 
 BASE = "base"
 _AXES = ("1 0 0", "0 1 0", "0 0 1")
-_OWN = 1e-12  # a coefficient that near to 1 is the joint itself
+_OWN = 1e-12  # a motion whose coefficient is 1 within this tolerance can be the joint itself
 
 
 def urdf_text(chain: Chain, x: Floats, remarks: Sequence[str]) -> str:
-    """Return a rig at parameters `x` (p,) as a URDF document, with remarks in a comment at its head."""
+    """Return a rig with parameters `x` (p,) as a URDF document, with remarks in a comment at its head."""
     body = "\n".join(f"  {line}" for line in urdf_elements(chain, x))
     return f'<?xml version="1.0"?>\n{xml_comment(remarks)}<robot name={quoteattr(chain.rig.name)}>\n{body}\n</robot>\n'
 
 
 def urdf_elements(chain: Chain, x: Floats, prefix: str = "") -> Iterator[str]:
-    """Yield the links and joints of a rig, one element a line.
+    """Yield the links and joints of a rig, one element per line.
 
     Args:
-        chain: kinematics.
+        chain: kinematics of the rig.
         x: (p,) parameters, mm and rad.
-        prefix: in front of every name.
+        prefix: prefix of every name.
     """
     return iter(_Elements(chain.rig, motion_tree(chain, x), prefix).lines)
 
 
 def xml_comment(remarks: Sequence[str]) -> str:
-    """Return remarks as a comment of XML; empty for none."""
-    text = "\n".join(remarks).replace("--", "- -")  # ends a comment in XML
+    """Return remarks as an XML comment; "" if there are none."""
+    text = "\n".join(remarks).replace("--", "- -")  # "--" is not allowed in a comment
     return f"<!--\n{text}\n-->\n" if remarks else ""
 
 
 class _Elements:
-    """Collects the elements; every term of a drive is a URDF joint of its own.
+    """Collects the elements; every term of a drive becomes a URDF joint.
 
-    A joint of the rig has the URDF joint of its name where it moves something one to one, or else one that moves an
-    empty link; all further motions follow it as mimic joints.
+    A joint of the rig becomes a URDF joint of the same name at a motion that it drives one to one. If there is no such
+    motion, the URDF joint moves an empty link. All other motions follow it as mimic joints.
     """
 
     def __init__(self, rig: Rig, tree: MotionTree, prefix: str) -> None:
@@ -70,7 +70,7 @@ class _Elements:
         self._masses(tree, links)
 
     def _first_motions(self, tree: MotionTree) -> dict[int, tuple[int, int]]:
-        """Return for joints that move something one to one: the motion and which of its terms it is."""
+        """Return the first motion that each joint drives one to one: joint -> (motion, term of its drive)."""
         found: dict[int, tuple[int, int]] = {}
         for index, motion in enumerate(tree.motions):
             for term, (joint, _) in enumerate(motion.drive):
@@ -81,13 +81,13 @@ class _Elements:
         return found
 
     def _ratio(self, motion: Motion, term: int) -> float:
-        """Return m or rad of a motion for each m or rad of the joint of one of its terms."""
+        """Return m or rad of a motion per m or rad of the joint in term `term` of its drive."""
         joint, coefficient = motion.drive[term]
         own = math.degrees(1.0) if self._rig.joints[joint].kind == "revolute" else 1e3
         return coefficient * own * (1.0 if motion.rotates else 1e-3)
 
     def _add(self, motion: Motion, index: int, parent: str) -> str:
-        """Add a motion; returns the link behind it."""
+        """Add a motion; return the name of the link after it."""
         name = motion.name.replace(".", "_")
         if not motion.drive:
             self._fixed(f"to_{name}", parent, name, motion.fixed)
@@ -107,7 +107,7 @@ class _Elements:
         return parent
 
     def _empty_joint(self, joint: int) -> None:
-        """Add a joint that moves nothing, for others to follow."""
+        """Add a joint that moves only an empty link, so that mimic joints can follow it."""
         own = self._rig.joints[joint]
         self._moving(joint, BASE, f"{own.name}_alone", np.eye(4), _AXES[2], own.kind == "revolute", None, "")
         self._link(f"{own.name}_alone")
@@ -151,7 +151,7 @@ class _Elements:
     def _masses(self, tree: MotionTree, links: dict[int, str]) -> None:
         for number, mass in enumerate(self._rig.masses, 1):
             shares = [(mass.frame, np.array(mass.centre_mm or (0.0, 0.0, 0.0)), mass.kg)]
-            if mass.midway:  # half of it at either end has the same weight and moment
+            if mass.midway:  # half of the mass at each end has the same weight and moment
                 shares = [(frame, np.zeros(3), mass.kg / 2.0) for frame in (mass.frame, mass.frame + 1)]
             for part, (frame, centre_mm, kg) in enumerate(shares):
                 if kg == 0.0:
@@ -169,7 +169,7 @@ class _Elements:
 
 
 def _si(joint: Joint, value: float) -> float:
-    """Return deg or mm of a joint in rad or m."""
+    """Return a value of a joint, deg or mm, in rad or m."""
     return math.radians(value) if joint.kind == "revolute" else value / 1e3
 
 

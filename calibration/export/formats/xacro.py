@@ -1,4 +1,4 @@
-"""model.xacro: as model.urdf, with a prefix in front of all names that the caller gives."""
+"""model.xacro: as model.urdf, with a prefix of all names that the caller gives."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from calibration.observations import Floats
 
 
 def xacro_text(chain: Chain, x: Floats, remarks: Sequence[str]) -> str:
-    """Return a rig at parameters `x` (p,) as a xacro document: a macro with a prefix of all names, used once."""
+    """Return a rig with parameters `x` (p,) as a xacro document: a macro with a prefix for all names, used once."""
     macro = "rigcal_rig"
     body = "\n".join(f"    {line}" for line in urdf_elements(chain, x, "${prefix}"))
     return (

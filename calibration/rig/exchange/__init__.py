@@ -1,1 +1,1 @@
-"""Rig files from the descriptions that other programs have: URDF and Denavit-Hartenberg tables."""
+"""Rig files from descriptions of other programs: URDF and Denavit-Hartenberg tables."""

@@ -1,4 +1,4 @@
-"""A rig file in the making: sections with their remarks, written as TOML."""
+"""A draft of a rig file: sections with remarks, written as TOML."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ distance_sigma_mm = 0.1
 distance_sigma_ppm = 1.0
 """
 LIMITS_ASSUMED = "limits assumed"  # the remark of a joint
-SIGMA = {"revolute": 0.002, "prismatic": 0.02}  # deg and mm; assumed of encoders that a description says nothing of
+SIGMA = {"revolute": 0.002, "prismatic": 0.02}  # deg and mm; assumed, as the imported descriptions do not give it
 
 
 @dataclass(frozen=True)
 class Section:
-    """A table of an array: its keys in order, and a remark on its first line."""
+    """One table of an array of tables: its keys in order, and a remark for its first line."""
 
     keys: Mapping[str, object]
     remark: str = ""
@@ -35,13 +35,13 @@ class Section:
 
 @dataclass
 class Draft:
-    """A rig file without tolerances and station, which no other description has.
+    """A rig file except tolerances and station, which are assumed because other descriptions do not have them.
 
     Attributes:
-        name: of the machine.
-        convention: of its rows.
-        source: what it was made from, for the file's first line.
-        notes: sentences on what was assumed and left out.
+        name: name of the machine.
+        convention: convention of its rows.
+        source: name of the imported file, for the first line of the rig file.
+        notes: sentences about what was assumed and what was left out.
         sections: `joint`, `row`, `prism` and `mass` -> tables.
     """
 
@@ -59,7 +59,7 @@ class Draft:
 
     @property
     def assumed(self) -> str:
-        """The sentence on what no other description says."""
+        """A sentence that lists what was assumed because the imported description does not have it."""
         joints = [str(t.keys["name"]) for t in self.sections["joint"] if LIMITS_ASSUMED in t.remark]
         limits = f"the limits of {', '.join(joints)}, " if joints else ""
         return f"Assumed: the random errors of readings (sigma), {limits}the build tolerances and the station."
@@ -69,7 +69,7 @@ class Draft:
         return "\n".join(self._lines()) + "\n"
 
     def rig(self) -> Rig:
-        """Return the rig that the text describes; RigError where the parts do not fit."""
+        """Return the rig that the text describes; raise RigError if its parts do not fit together."""
         return parse_rig(self.text(), self.name)
 
     def _lines(self) -> Iterator[str]:
@@ -90,7 +90,12 @@ class Draft:
 
 
 def free_name(wanted: str, taken: Collection[str]) -> str:
-    """Return a rig file's name (letters, digits, underscores) for any name, one that is not taken."""
+    """Return a name that is valid in a rig file (letters, digits, underscores) and not in `taken`.
+
+    Args:
+        wanted: any name; the result is as similar to it as possible.
+        taken: names that are in use.
+    """
     plain = re.sub(r"[^A-Za-z0-9]+", "_", wanted).strip("_")
     plain = plain if plain[:1].isalpha() else f"n_{plain}".rstrip("_")
     number, name = 2, plain
@@ -100,7 +105,7 @@ def free_name(wanted: str, taken: Collection[str]) -> str:
 
 
 def _value(value: object) -> str:
-    """Return a value as TOML has it."""
+    """Return a value formatted as TOML."""
     if isinstance(value, Mapping):
         return "{ " + ", ".join(f"{key} = {_value(item)}" for key, item in value.items()) + " }"
     if isinstance(value, str):

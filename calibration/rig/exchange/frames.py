@@ -1,9 +1,9 @@
-"""Row constants of modified Denavit-Hartenberg frames on given axes, exact to rounding.
+"""Row constants of modified Denavit-Hartenberg frames for given joint axes, exact to rounding.
 
-Rows are those of the convention `mdh_beta_after`: Trans(x,a) Rot(x,alpha) Trans(z,d) Rot(z,theta) Rot(y,beta). The
-frame after a row is fixed to its link and is chosen for the axis that follows: x along the common normal (Craig,
-Introduction to Robotics, ch. 3), or, where the axes are nearly parallel, towards the next joint with the angle beta
-between them (Hayati and Mirmirani, 1985), so that no length grows beyond bounds. Lengths mm, angles rad.
+Rows follow the convention `mdh_beta_after`: Trans(x,a) Rot(x,alpha) Trans(z,d) Rot(z,theta) Rot(y,beta). The frame
+after a row is fixed to its link, and its x axis depends on the next joint axis: x is along the common normal (Craig,
+Introduction to Robotics, ch. 3). If the axes are nearly parallel, x points towards the next joint, with the angle beta
+between the axes (Hayati and Mirmirani, 1985), so that all lengths stay bounded. Lengths mm, angles rad.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from calibration.rig.parts import NEARLY_PARALLEL
 Floats = NDArray[np.float64]
 
 _COAXIAL_MM = 1e-10
-_NOTHING = 1e-15  # rounding of a cosine
-_SNAP = 1e-12  # of deg and mm: rounding of the arithmetic and not of the file
+_NOTHING = 1e-15  # rounding error of a cosine
+_SNAP = 1e-12  # deg and mm: larger than rounding errors of the arithmetic, smaller than digits of the file
 
 
 @dataclass(frozen=True)
@@ -33,13 +33,13 @@ class Line:
 
 @dataclass(frozen=True)
 class Link:
-    """The frame that a row ends in and the step from there to the next axis.
+    """The frame after a row and the step from there to the next axis.
 
     Attributes:
         before_beta: (4, 4) frame on the row's own axis, before Rot(y,beta).
-        beta: rad.
-        a, alpha: of the next row, mm and rad.
-        is_parallel: True if the two axes are nearly parallel, so that beta counts and d does not.
+        beta: constant of the row, rad.
+        a, alpha: constants of the next row, mm and rad.
+        is_parallel: True if the two axes are nearly parallel, so that beta can be identified and d cannot.
     """
 
     before_beta: Floats
@@ -53,9 +53,9 @@ def link_frame(axis: Line, following: Line, x_hint: Floats) -> Link:
     """Choose the frame of a link between two axes.
 
     Args:
-        axis: its own.
-        following: the next.
-        x_hint: (3,) direction that x takes where nothing else settles it.
+        axis: axis of the link's own joint.
+        following: axis of the next joint.
+        x_hint: (3,) direction of x if the two axes do not determine it.
     """
     z, u = axis.direction, following.direction
     between = following.point_mm - axis.point_mm
@@ -66,7 +66,7 @@ def link_frame(axis: Line, following: Line, x_hint: Floats) -> Link:
     x = normal / sine
     if (a := float(between @ x)) < -_COAXIAL_MM or (abs(a) <= _COAXIAL_MM and float(x @ x_hint) < 0.0):
         x, a = -x, -a
-    along = float(np.cross(between, u) @ normal) / sine**2  # of the foot of the common normal on the own axis
+    along = float(np.cross(between, u) @ normal) / sine**2  # position of the common normal's foot along the own axis
     alpha = math.atan2(float(np.cross(z, u) @ x), float(z @ u))
     return Link(_frame(z, x, axis.point_mm + along * z), 0.0, a, alpha, is_parallel=False)
 
@@ -86,7 +86,12 @@ def _parallel(axis: Line, following: Line, x_hint: Floats) -> Link:
 
 
 def end_frame(axis: Line, link: Floats) -> Floats:
-    """Return the (4, 4) frame of a row that no axis follows: the link's own (4, 4) as nearly as the axis allows."""
+    """Return the (4, 4) frame after the last row of a chain: z on the axis, x as near as possible to the link's x.
+
+    Args:
+        axis: axis of the row's joint.
+        link: (4, 4) frame of the link.
+    """
     x = _across(link[:3, 0], axis.direction)
     if float(np.linalg.norm(x)) < 1e-6:
         x = _across(link[:3, 1], axis.direction)
@@ -94,14 +99,14 @@ def end_frame(axis: Line, link: Floats) -> Floats:
 
 
 def step_along(start: Floats, goal: Floats) -> tuple[float, float]:
-    """Return d and theta that take a frame (4, 4) to another one on the same z axis."""
+    """Return d, mm, and theta, rad, from frame `start` (4, 4) to frame `goal` (4, 4) on the same z axis."""
     between = start[:3, :3].T @ (goal[:3, 3] - start[:3, 3])
     x = start[:3, :3].T @ goal[:3, 0]
     return float(between[2]), math.atan2(x[1], x[0])
 
 
 def turned(frame: Floats, axis: str, angle_rad: float) -> Floats:
-    """Return frame (4, 4) turned about its own x, y or z."""
+    """Return a frame (4, 4) rotated about its own axis `x`, `y` or `z`."""
     c, s = math.cos(angle_rad), math.sin(angle_rad)
     u, v = {"x": (1, 2), "y": (2, 0), "z": (0, 1)}[axis]
     turn = np.eye(4)
@@ -112,7 +117,7 @@ def turned(frame: Floats, axis: str, angle_rad: float) -> Floats:
 
 
 def moved(frame: Floats, axis: int, length_mm: float) -> Floats:
-    """Return frame (4, 4) moved along its own axis 0, 1 or 2."""
+    """Return a frame (4, 4) translated along its own axis 0, 1 or 2."""
     out: Floats = frame.copy()
     out[:3, 3] += length_mm * frame[:3, axis]
     return out
@@ -121,7 +126,7 @@ def moved(frame: Floats, axis: int, length_mm: float) -> Floats:
 def angles_zyx(rotation: Floats) -> tuple[float, float, float]:
     """Return (yaw, pitch, roll) with rotation = Rot(z,yaw) Rot(y,pitch) Rot(x,roll), rad.
 
-    Pitch and roll are those that go with the yaw chosen, so that nothing is lost near a pitch of 90 degrees.
+    Pitch and roll are computed with the yaw returned, so that the result is exact also near a pitch of 90 degrees.
     """
     level = rotation[1, 0], rotation[0, 0]
     yaw = math.atan2(*level) if math.hypot(*level) > _NOTHING else 0.0
@@ -131,7 +136,7 @@ def angles_zyx(rotation: Floats) -> tuple[float, float, float]:
 
 
 def tidy(value: float) -> float:
-    """Return a number of deg or mm without the rounding of the arithmetic that made it."""
+    """Return a number of deg or mm without the rounding errors of the arithmetic that computed it."""
     value = float(value)
     for digits in range(10):
         near = round(value, digits)

@@ -1,12 +1,17 @@
 """A rig from a Denavit-Hartenberg table: a CSV file with one row of constants for each joint.
 
-The columns are those of a row of a rig file, in any order and with other units where the name says so: `alpha_deg` or
-`alpha_rad`, `a_mm` or `a_m`, likewise `d`, `theta`, `beta` and `b`. A joint is named by `joint`, with `kind`
-(`revolute` by default), `lower` and `upper` in deg or mm, and `max_rate`. A row that several joints drive, or one that
-drives `a`, says so in `theta_drive`, `d_drive` or `a_drive`: `0.5*q1 - q2`; where there are such columns, a line with
-nothing but a joint's cells is no row and describes the joint alone. `after`, `x_mm` ... `rx_deg` and `identify` are
-those of a rig file. A line with `prism` is no row but a prism on the frame `frame` (the last row's by default), with
-its place `prism_x_mm` and so on. A comment `# convention: NAME` says how the constants are meant.
+Columns, in any order:
+
+* the constants of a row of a rig file, in either unit: `alpha_deg` or `alpha_rad`, `a_mm` or `a_m`, likewise `d`,
+  `theta`, `beta` and `b`;
+* `joint` names a joint, with `kind` (`revolute` by default), `lower` and `upper` in deg or mm, and `max_rate`;
+* `theta_drive`, `d_drive` and `a_drive` hold a sum such as `0.5*q1 - q2`, for rows that several joints drive or whose
+  `a` is driven. In a table with such a column, a line with only cells of a joint is not a row: it describes the joint;
+* `after`, `x_mm` ... `rx_deg` and `identify` are as in a rig file;
+* `prism` makes the line a prism instead of a row, on the frame `frame` (by default that of the last row), at
+  `prism_x_mm` and so on.
+
+A comment `# convention: NAME` gives the convention of the constants.
 """
 
 from __future__ import annotations
@@ -49,15 +54,15 @@ _MOST_LINES = 1000
 
 
 def draft_of_table(text: str, source: str, convention: Convention | None = None) -> Draft:
-    """Make a rig file of a Denavit-Hartenberg table.
+    """Make a rig file from a Denavit-Hartenberg table.
 
     Args:
         text: CSV.
-        source: its file's name.
-        convention: how its constants are meant; by default as a comment in the file says, or standard (`dh`).
+        source: name of its file.
+        convention: convention of the constants; by default that of a comment in the file, or else standard (`dh`).
 
     Raises:
-        RigError: unknown columns, cells that are no numbers, rows that drive nothing anywhere; with the line.
+        RigError: unknown columns, cells that are not numbers, no row with a joint; with the line.
     """
     return _Table(text, source, convention).draft()
 
@@ -67,10 +72,11 @@ class _Table:
         self._source = source
         lines = text.removeprefix("\ufeff").splitlines()
         if len(lines) > _MOST_LINES:
-            raise RigError(source, "", f"{len(lines)} lines, {_MOST_LINES} at most are read")
+            raise RigError(source, "", f"{len(lines)} lines; the maximum is {_MOST_LINES}")
         stated = next((m[1] for m in map(_CONVENTION.fullmatch, lines) if m), None)
         if stated is not None and stated not in get_args(Convention):
-            raise RigError(source, "convention", f"{stated!r} is none of {', '.join(get_args(Convention))}")
+            reason = f"{stated!r} is unknown; give one of {', '.join(get_args(Convention))}"
+            raise RigError(source, "convention", reason)
         known: Mapping[str, Convention] = {name: name for name in get_args(Convention)}
         self._convention = convention or known[stated or "dh"]
         self._draft = Draft(source.rpartition(".")[0] or source, self._convention, source)
@@ -81,7 +87,7 @@ class _Table:
     def draft(self) -> Draft:
         draft, rows = self._draft, list(self._rows())
         if not rows:
-            raise RigError(self._source, "", "it has no rows below its header")
+            raise RigError(self._source, "", "no rows below the header")
         continued = set()
         for line, cells in rows:
             if "prism" in cells:
@@ -93,12 +99,12 @@ class _Table:
                 row = len(draft.sections["row"])
                 continued.add(int(self._number(line, cells, "after", row - 1)))
         if not draft.sections["joint"]:
-            raise RigError(self._source, "", "no row names a joint, in a column `joint` or `theta_drive`")
+            raise RigError(self._source, "", "no row names a joint; add a column `joint` or `theta_drive`")
         if not draft.sections["prism"]:
             for end in sorted(set(range(1, len(draft.sections["row"]) + 1)) - continued):
                 name = "tool" if not draft.sections["prism"] else f"tool_{end}"
                 keys = {"name": free_name(name, self._kinds), "frame": end, "offset_mm": [0.0, 0.0, 0.0]}
-                draft.add("prism", keys | {"offset_known": False}, "where the reflector sits is not known")
+                draft.add("prism", keys | {"offset_known": False}, "the position of the reflector is not known")
         draft.notes += [
             f"Convention: {self._convention}.",
             draft.assumed,
@@ -107,22 +113,22 @@ class _Table:
 
     def _rows(self) -> Iterator[tuple[int, dict[str, str]]]:
         if not self._lines:
-            raise RigError(self._source, "", "it is empty")
+            raise RigError(self._source, "", "the file is empty")
         (first, header), *lines = self._lines
         names = [name.strip() for name in next(csv.reader([header]))]
         unknown = [name for name in names if name not in _KNOWN]
         if unknown or len(set(names)) < len(names):
-            what = f"unknown column {unknown[0]!r}" if unknown else "two columns have one name"
+            what = f"unknown column {unknown[0]!r}" if unknown else "two columns have the same name"
             if len(names) == 1 and any(mark in header for mark in ";\t"):
                 raise RigError(
-                    self._source, "header", "separate columns by commas, and write decimals with a point", first
+                    self._source, "header", "separate columns by commas, and use a point for decimals", first
                 )
-            raise RigError(self._source, "header", f"{what}; there are {', '.join(sorted(_KNOWN))}", first)
+            raise RigError(self._source, "header", f"{what}; possible columns: {', '.join(sorted(_KNOWN))}", first)
         self._has_drives = any(f"{driven}_drive" in names for driven in DRIVES)
         for number, line in lines:
             cells = [cell.strip() for cell in next(csv.reader(io.StringIO(line)))]
             if len(cells) != len(names):
-                raise RigError(self._source, "", f"{len(cells)} cells, the header has {len(names)}", number)
+                raise RigError(self._source, "", f"{len(cells)} cells, but the header has {len(names)}", number)
             yield number, {name: cell for name, cell in zip(names, cells, strict=True) if cell}
 
     def _add_row(self, line: int, cells: Mapping[str, str]) -> None:
@@ -168,13 +174,13 @@ class _Table:
     def _add_joint(self, line: int, cells: Mapping[str, str], kind: str) -> None:
         name = cells.get("joint", "")
         if not name:
-            raise RigError(self._source, "joint", "the line has limits, and names no joint that they are of", line)
+            raise RigError(self._source, "joint", "empty; name the joint that the cells of this line describe", line)
         if name in self._kinds:
             given = next(t.keys["limits"] for t in self._draft.sections["joint"] if t.keys["name"] == name)
             assert isinstance(given, list)
             for column, limit in zip(("lower", "upper"), given, strict=True):
                 if column in cells and self._number(line, cells, column, 0.0) != limit:
-                    reason = f"joint {name!r} has {limit:g} on a line before; a joint has its limits once"
+                    reason = f"joint {name!r} has {limit:g} on an earlier line; give the same limits, or give them once"
                     raise RigError(self._source, column, reason, line)
             return
         self._kinds[name] = kind
@@ -191,7 +197,7 @@ class _Table:
         while at < len(text):
             found = _TERM.match(text, at)
             if found is None or (terms and not found[1]):
-                raise RigError(self._source, "drive", f"{text!r} is no sum such as 0.5*q1 - q2", line)
+                raise RigError(self._source, "drive", f"{text!r} is not a sum such as 0.5*q1 - q2", line)
             size = float(found[2]) if found[2] else 1.0
             terms[found[3]] = terms.get(found[3], 0.0) + (-size if found[1] == "-" else size)
             at = found.end()

@@ -1,8 +1,8 @@
-"""A rig from a URDF: the joints between its base and its tips, on modified Denavit-Hartenberg rows.
+"""A rig from a URDF: the joints between base and tips as modified Denavit-Hartenberg rows.
 
-The rows have the constants that a calibration can identify and no others: four from axis to axis, beta where the axes
-are nearly parallel. What branches off a link gets a row of its own that drives nothing, so that its mounting can be
-corrected. Joints that move no tip stand at zero, and their links' masses rest where that puts them.
+The rows have exactly the constants that a calibration can identify: four from axis to axis, and beta where the axes are
+nearly parallel. A branch from a link starts with a row without drive, so that its mounting can be corrected. Joints
+that move no tip are kept at zero, and the masses of their links at the resulting places.
 """
 
 from __future__ import annotations
@@ -30,22 +30,22 @@ from calibration.rig.exchange.frames import (
 from calibration.rig.exchange.urdf import Mimic, Urdf, UrdfJoint
 
 _TURN_DEG = 180.0
-_TRAVEL_MM = 1000.0  # assumed where a slide's limits are not given
-_SAME = 1e-12  # of a matrix that ought to be the identity; mm and plain numbers
+_TRAVEL_MM = 1000.0  # assumed limit of a slide for which the URDF gives none
+_SAME = 1e-12  # tolerance of a matrix that should be the identity; mm and plain numbers
 _IDENTIFIED = ("alpha", "a", "d", "theta")
 
 
 @dataclass
 class _Node:
-    """A joint that moves some tip, or the base: its axis, its link's frame, and its place among the rows.
+    """The base, or a joint that moves a tip: its axis, its link's frame, and its row.
 
     Attributes:
-        joint: None for the base.
-        line: its axis; z of its frame for the base.
-        link: (4, 4) frame of its link at zero.
-        children: joints whose axes follow.
-        row: number of its row; 0 for the base.
-        frame: (4, 4) that its row ends in, by the row's constants as the file has them.
+        joint: the joint; None for the base.
+        line: axis of the joint; for the base, the z axis of its frame.
+        link: (4, 4) frame of the joint's link at zero.
+        children: the next joints.
+        row: number of the joint's row; 0 for the base.
+        frame: (4, 4) frame after the row, computed from its constants as written to the file.
     """
 
     joint: UrdfJoint | None
@@ -57,16 +57,16 @@ class _Node:
 
 
 def draft_of_urdf(urdf: Urdf, source: str, base: str | None = None, tips: Sequence[str] = ()) -> Draft:
-    """Make a rig file of a URDF.
+    """Make a rig file from a URDF.
 
     Args:
         urdf: the description.
-        source: its file's name.
-        base: link that the rig stands on; the root by default.
+        source: name of its file.
+        base: link that is the base of the rig; the root by default.
         tips: links that carry a prism; by default every link at the end of a chain.
 
     Raises:
-        RigError: unknown links, a tip that nothing moves, a joint that moves in several directions.
+        RigError: unknown links, a tip that no joint moves, a joint that moves in several directions.
     """
     return _Import(urdf, source, base or urdf.root, tips).run()
 
@@ -76,7 +76,7 @@ class _Import:
         self._urdf, self._source, self._base = urdf, source, base
         for link in (base, *tips):
             if link not in urdf.links:
-                raise RigError(source, "", f"there is no link {link!r}; it has {', '.join(urdf.links)}")
+                raise RigError(source, "", f"there is no link {link!r}; the links are {', '.join(urdf.links)}")
         self._tips = tuple(dict.fromkeys(tips)) or self._ends()
         self._draft = Draft(urdf.name, "mdh_beta_after", source)
         self._out_of_base = np.linalg.inv(urdf.place(base))
@@ -97,14 +97,14 @@ class _Import:
         self._draft.notes += [
             self._draft.assumed,
             "Left out: shapes, efforts, friction and transmissions, which rigcal does not use.",
-            *([f"At zero, because no tip moves with them: {', '.join(still)}."] if still else []),
+            *([f"Joints kept at zero, because they move no tip: {', '.join(still)}."] if still else []),
         ]
         return self._draft
 
     def _ends(self) -> tuple[str, ...]:
-        """Return, of every moving chain that nothing moving continues, the last link along fixed joints."""
+        """Return the end links: for the last moving joint of every chain, the last link along its fixed joints."""
         below: dict[str, list[UrdfJoint]] = {}
-        moving: set[str] = set()  # links that something beyond moves on
+        moving: set[str] = set()  # links with a moving joint further along the chain
         for joint in self._urdf.joints.values():
             below.setdefault(joint.parent, []).append(joint)
             link: str | None = joint.parent if joint.moves else None
@@ -119,7 +119,7 @@ class _Import:
                     end = below[end][0].child
                 ends.append(end)
         if not ends:
-            raise RigError(self._source, "", f"nothing moves on link {self._base!r}")
+            raise RigError(self._source, "", f"no joint moves anything on link {self._base!r}; choose another base")
         return tuple(ends)
 
     def _is_inside(self, link: str) -> bool:
@@ -132,7 +132,7 @@ class _Import:
             return []
         first = next((i for i, joint in enumerate(way) if joint.parent == self._base), None)
         if first is None:
-            raise RigError(self._source, f"link {link!r}", f"it does not stand on the base {self._base!r}")
+            raise RigError(self._source, f"link {link!r}", f"not connected to the base {self._base!r}; leave it out")
         return way[first:]
 
     def _place(self, link: str) -> Floats:
@@ -142,14 +142,14 @@ class _Import:
     def _add_way(self, tip: str) -> None:
         node, moving = self._root, [joint for joint in self._way(tip) if joint.moves or joint.kind is None]
         if not moving:
-            raise RigError(self._source, f"link {tip!r}", f"nothing moves it on the base {self._base!r}")
+            raise RigError(self._source, f"link {tip!r}", f"no joint moves it relative to the base {self._base!r}")
         for joint in moving:
             if joint.kind is None:
                 raise RigError(
                     self._source,
                     f"joint {joint.name!r}",
-                    "it moves in several directions (floating or planar), which no row of a rig does; give a link "
-                    "beyond it as --base",
+                    "it moves in several directions (floating or planar), which a row of a rig cannot describe; give a "
+                    "link beyond it as --base",
                 )
             if joint.name not in self._nodes:
                 link = self._place(joint.child)
@@ -161,7 +161,7 @@ class _Import:
     # -- joints --------------------------------------------------------------------------------------------------------
 
     def _source_of(self, joint: UrdfJoint) -> tuple[UrdfJoint, Mimic]:
-        """Return the joint whose reading moves a joint, and how."""
+        """Return the joint whose reading moves `joint`, and the linear relation between the two."""
         named = {j.name: j for j in self._urdf.joints.values()}
         how, seen = Mimic(joint.name, 1.0, 0.0), {joint.name}
         while joint.mimic is not None:
@@ -171,10 +171,10 @@ class _Import:
             )
             joint = named[further.joint]
             if joint.name in seen:
-                raise RigError(self._source, f"joint {joint.name!r}", "it mimics itself, by way of others")
+                raise RigError(self._source, f"joint {joint.name!r}", "it mimics itself, through other joints")
             seen.add(joint.name)
         if joint.kind not in ("revolute", "prismatic"):
-            raise RigError(self._source, f"joint {joint.name!r}", "another joint mimics it, and it does not move")
+            raise RigError(self._source, f"joint {joint.name!r}", "another joint mimics it, but it does not move")
         return joint, how
 
     def _name_joints(self) -> None:
@@ -203,7 +203,7 @@ class _Import:
     # -- rows ----------------------------------------------------------------------------------------------------------
 
     def _add_rows(self, node: _Node) -> None:
-        """Add the rows of all that follows a joint, depth first."""
+        """Add the rows of all joints after a joint, depth first."""
         for number, child in enumerate(node.children):
             if node.joint is None and number == 0:
                 self._add_first(child)
@@ -214,18 +214,18 @@ class _Import:
             self._add_rows(child)
 
     def _link(self, node: _Node, number: int = 0) -> Link | None:
-        """Return the step from a joint to one that follows; None where none does."""
+        """Return the step from a joint to its child `number`; None if it has no children."""
         if not node.children:
             return None
         return link_frame(node.line, node.children[number].line, node.link[:3, 0])
 
     def _goal(self, child: _Node) -> Floats:
-        """Return the frame that a joint's row should end in, but for beta."""
+        """Return the frame after a joint's row, before the rotation by beta."""
         link = self._link(child)
         return end_frame(child.line, child.link) if link is None else link.before_beta
 
     def _add_first(self, child: _Node) -> None:
-        """The first joint on the base: its mounting is part of the base's, which is always estimated."""
+        """Add the row of the first joint; its mounting is part of the base transform, which is always estimated."""
         self._append(child, 0, self._goal(child), 0.0, 0.0, (), fixed=True)
 
     def _add_row(self, child: _Node, after: int, link: Link | None, frame: Floats | None) -> None:
@@ -234,7 +234,7 @@ class _Import:
         self._append(child, after, turned(moved(frame, 0, link.a), "x", link.alpha), link.a, link.alpha, _IDENTIFIED)
 
     def _add_branch(self, node: _Node, child: _Node) -> None:
-        """A further joint on the same link: a row without drive first, about and along the axis before it."""
+        """Add the rows of a further joint on a link: first a row without drive, about and along the link's own axis."""
         link = link_frame(node.line if node.joint else self._root.line, child.line, node.link[:3, 0])
         assert node.frame is not None
         d, theta = step_along(node.frame, link.before_beta)
@@ -255,7 +255,7 @@ class _Import:
         *,
         fixed: bool = False,
     ) -> None:
-        """Add the row of a joint, whose axis is z of `start`."""
+        """Add the row of a joint whose axis is the z axis of the frame `start`."""
         joint = child.joint
         assert joint is not None
         link, goal = self._link(child), self._goal(child)
@@ -269,7 +269,7 @@ class _Import:
         if link is not None and link.is_parallel:
             identify = (*identify, "beta")
         remark = joint.name if source is joint else f"{joint.name}, which follows {source.name}"
-        offset = how.offset  # belongs to the constant, and not to the machine at zero readings
+        offset = how.offset  # part of the row's constant, but not of the frames at zero joint values
         before = start if fixed else None
         child.row, child.frame = self._row(after, start, keys, drive, identify, remark, before, offset)
 
@@ -284,7 +284,7 @@ class _Import:
         before: Floats | None = None,
         offset: float = 0.0,
     ) -> tuple[int, Floats]:
-        """Add a row; returns its number, and the (4, 4) frame that its constants, as written, end in."""
+        """Add a row; return its number and the (4, 4) frame after it, computed from the constants as written."""
         rows = self._draft.sections["row"]
         table: dict[str, object] = {}
         if after != len(rows):
@@ -340,7 +340,7 @@ class _Import:
             self._draft.add(
                 "prism",
                 {"name": name, "frame": frame, "offset_mm": [0.0, 0.0, 0.0], "offset_known": False},
-                f"link {tip}; where on it the reflector sits is not known",
+                f"link {tip}; the position of the reflector on it is not known",
             )
 
     def _add_masses(self) -> None:
@@ -365,7 +365,7 @@ INERTIA_ORDER = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 
 def _transform(matrix: Floats) -> tuple[dict[str, float], Floats]:
-    """Return the keys of `before` for a transform (4, 4), and the transform that they make."""
+    """Return the keys of `before` for a transform (4, 4), and the transform that these keys describe."""
     turns = [tidy(math.degrees(angle)) for angle in angles_zyx(matrix[:3, :3])]
     shifts = [tidy(length) for length in matrix[:3, 3]]
     frame = np.eye(4)

@@ -1,7 +1,7 @@
-"""URDF documents, read into links and joints; lengths mm, angles rad, and the transforms at zero joint values.
+"""Reading of URDF documents into links and joints; lengths mm, angles rad, transforms at zero joint values.
 
 Source: the URDF specification of ROS (wiki.ros.org/urdf/XML). Geometry, transmissions, friction and safety limits are
-passed over.
+ignored.
 """
 
 from __future__ import annotations
@@ -18,9 +18,10 @@ from calibration.errors import RigError
 
 Floats = NDArray[np.float64]
 
-LONGEST = 1 << 24  # characters; a humanoid with its meshes' names has some 200,000
+LONGEST = 1 << 24  # characters; a humanoid with the names of its meshes has some 200,000
 _MOST_ELEMENTS = 20_000
-_LARGEST = 1e9  # of metres, radians and directions
+_MOST_TAGS = 3 * _MOST_ELEMENTS  # an element has two, and may have a comment
+_LARGEST = 1e9  # largest number of metres or radians, and largest component of a direction
 _TURNING, _SLIDING, _FREE = ("revolute", "continuous"), ("prismatic",), ("floating", "planar")
 
 
@@ -29,9 +30,9 @@ class Inertial:
     """A link's mass.
 
     Attributes:
-        kg: mass.
+        kg: the mass.
         centre_mm: (3,) centre of gravity in the link's frame.
-        inertia_kg_m2: (3, 3) about the centre, along the link's axes.
+        inertia_kg_m2: (3, 3) inertia tensor about the centre, along the link's axes.
     """
 
     kg: float
@@ -41,7 +42,7 @@ class Inertial:
 
 @dataclass(frozen=True)
 class Mimic:
-    """A joint that follows another one: value = multiplier * value of `joint` + offset, rad and mm."""
+    """How a joint follows another: value = multiplier * value of `joint` + offset, rad or mm."""
 
     joint: str
     multiplier: float
@@ -53,14 +54,14 @@ class UrdfJoint:
     """A joint.
 
     Attributes:
-        name: its own.
-        kind: `revolute`, `prismatic` or `fixed`; None for one that moves in several directions (floating, planar).
+        name: name of the joint.
+        kind: `revolute`, `prismatic` or `fixed`; None if it moves in several directions (floating, planar).
         parent, child: names of links.
-        origin: (4, 4) of the child's frame in the parent's, at zero.
+        origin: (4, 4) frame of the child in the frame of the parent, at zero.
         axis: (3,) unit vector in the child's frame.
-        limits: rad or mm; None where it has none (continuous, or the file says nothing).
-        max_rate: rad/s or mm/s; None where the file says nothing.
-        mimic: what it follows.
+        limits: lowest and highest value, rad or mm; None if continuous or not in the file.
+        max_rate: fastest motion, rad/s or mm/s; None if not in the file.
+        mimic: the relation to the joint that it follows; None if it does not follow one.
     """
 
     name: str
@@ -75,7 +76,7 @@ class UrdfJoint:
 
     @property
     def moves(self) -> bool:
-        """True unless it is fixed, or locked by equal limits."""
+        """True if the joint is revolute or prismatic and is not locked by equal limits."""
         return self.kind in ("revolute", "prismatic") and (self.limits is None or self.limits[0] < self.limits[1])
 
 
@@ -84,9 +85,9 @@ class Urdf:
     """A robot description.
 
     Attributes:
-        name: of the robot.
-        links: name -> inertial; None where a link has none.
-        joints: by the name of their child link.
+        name: name of the robot.
+        links: name -> inertial; None for a link without one.
+        joints: name of the child link -> joint.
     """
 
     name: str
@@ -95,7 +96,7 @@ class Urdf:
 
     @property
     def root(self) -> str:
-        """The link that is no joint's child."""
+        """The link that is not the child of any joint."""
         return next(link for link in self.links if link not in self.joints)
 
     def way(self, link: str) -> list[UrdfJoint]:
@@ -107,7 +108,7 @@ class Urdf:
         return way[::-1]
 
     def place(self, link: str) -> Floats:
-        """Return the (4, 4) frame of a link in the root's at zero."""
+        """Return the (4, 4) frame of a link in the frame of the root, at zero joint values."""
         out = np.eye(4)
         for joint in self.way(link):
             out = out @ joint.origin
@@ -122,18 +123,18 @@ def parse_urdf(text: str, source: str) -> Urdf:
         source: file name for messages.
 
     Raises:
-        RigError: malformed XML, xacro that was not expanded, numbers that are none, links that form no tree.
+        RigError: malformed XML, xacro that was not expanded, invalid numbers, links that do not form a tree.
     """
     if len(text) > LONGEST:
-        raise RigError(source, "", f"it has {len(text):,} characters, {LONGEST:,} at most are read")
-    if (elements := text.count("<") - text.count("</") - text.count("<!")) > _MOST_ELEMENTS:  # before they take memory
-        raise RigError(source, "", f"it has {elements:,} elements, {_MOST_ELEMENTS:,} at most are read")
+        raise RigError(source, "", f"the text has {len(text):,} characters; the maximum is {LONGEST:,}")
+    if (tags := text.count("<")) > _MOST_TAGS:  # parsed elements would take hundreds of times the memory of their text
+        raise RigError(source, "", f"it has {tags:,} tags and comments; the maximum is {_MOST_TAGS:,}")
     if "<!DOCTYPE" in text:
-        raise RigError(source, "", "it declares a document type, which no URDF needs and rigcal does not read")
+        raise RigError(source, "", "it declares a document type, which rigcal does not read; remove <!DOCTYPE ...>")
     try:
         root = ET.fromstring(text)
     except ET.ParseError as error:
-        raise RigError(source, f"line {error.position[0]}", f"no XML: {error}") from error
+        raise RigError(source, f"line {error.position[0]}", f"not valid XML: {error}") from error
     return _Reader(source).robot(root)
 
 
@@ -144,15 +145,15 @@ class _Reader:
     def robot(self, root: ET.Element) -> Urdf:
         elements = list(root.iter())
         if _plain(root.tag) != "robot":
-            raise self._fault("", f"no URDF: the outermost element is <{_plain(root.tag)}>, not <robot>")
+            raise self._fault("", f"not a URDF: the outermost element is <{_plain(root.tag)}>, not <robot>")
         if len(elements) > _MOST_ELEMENTS:
-            raise self._fault("", f"it has {len(elements):,} elements, {_MOST_ELEMENTS:,} at most are read")
+            raise self._fault("", f"it has {len(elements):,} elements; the maximum is {_MOST_ELEMENTS:,}")
         raw = next((e for e in elements if "xacro" in e.tag), None)
         if raw is not None:
             raise self._fault(
-                f"<{_plain(raw.tag)}>", "xacro that was not expanded; run `xacro FILE > ROBOT.urdf`, and import that"
+                f"<{_plain(raw.tag)}>", "xacro that is not expanded; run `xacro FILE > ROBOT.urdf`, and import that"
             )
-        for element in elements:  # a namespace of the whole document says nothing
+        for element in elements:  # a namespace of the whole document has no meaning here
             element.tag = _plain(element.tag)
         links = self._links(root)
         stated = [self._joint(e) for e in root.findall("joint")]
@@ -183,36 +184,40 @@ class _Reader:
             if by_child[joint.child] is not joint:
                 raise self._fault(f"link {joint.child!r}", "it is the child of two joints; a rig is a tree")
             if joint.mimic is not None and joint.mimic.joint not in names:
-                raise self._fault(f"joint {joint.name!r}", f"it mimics {joint.mimic.joint!r}, which is no joint")
+                reason = f"it mimics {joint.mimic.joint!r}, but there is no joint of that name"
+                raise self._fault(f"joint {joint.name!r}", reason)
         roots = [link for link in links if link not in by_child]
         if len(roots) != 1:
             said = f" ({', '.join(roots[:5])}{', ...' if len(roots) > 5 else ''})" if roots else ""
-            raise self._fault("link", f"{len(roots)} links are no joint's child{said}; a rig has one base")
+            raise self._fault(
+                "link", f"{len(roots)} links are not the child of a joint{said}; a rig has one such, its base"
+            )
         for start in by_child:
             link, steps = start, 0
             while link in by_child:
                 link, steps = by_child[link].parent, steps + 1
                 if steps > len(by_child):
-                    raise self._fault(f"link {start!r}", "its joints go round in a circle")
+                    raise self._fault(f"link {start!r}", "its joints form a loop; a rig is a tree")
 
     def _joint(self, element: ET.Element) -> UrdfJoint:
         name = self._name(element)
         where = f"joint {name!r}"
         kind = element.get("type", "")
         if kind not in (*_TURNING, *_SLIDING, *_FREE, "fixed"):
-            raise self._fault(where, f"no type of joint: {kind!r}")
+            types = ", ".join((*_TURNING, *_SLIDING, *_FREE, "fixed"))
+            raise self._fault(where, f"unknown type of joint {kind!r}; possible types: {types}")
         slides = kind in _SLIDING
         axis = self._vector(element.find("axis"), "xyz", where, (1.0, 0.0, 0.0))
         length = float(np.linalg.norm(axis))
         if length == 0.0 and kind in (*_TURNING, *_SLIDING):
-            raise self._fault(where, "its axis has no direction")
+            raise self._fault(where, "its axis is zero")
         limit = element.find("limit")
         scale = 1e3 if slides else 1.0
         limits = max_rate = None
         if limit is not None and kind != "continuous":
             low, high = (self._number(limit, key, where, 0.0) * scale for key in ("lower", "upper"))
             if low > high:
-                raise self._fault(where, f"its limits fall: {low:g} .. {high:g}")
+                raise self._fault(where, f"its lower limit {low:g} is greater than its upper limit {high:g}")
             stated = "lower" in limit.attrib or "upper" in limit.attrib
             limits = (low, high) if stated else None
         if limit is not None and (rate := self._number(limit, "velocity", where, 0.0)) > 0.0:
@@ -243,7 +248,7 @@ class _Reader:
             return None
         kg = self._number(mass, "value", where, 0.0)
         if kg < 0.0:
-            raise self._fault(where, f"a mass of {kg:g} kg")
+            raise self._fault(where, f"its mass is {kg:g} kg; it must not be negative")
         origin = self._origin(found.find("origin"), where)
         tensor, inertia = found.find("inertia"), np.zeros((3, 3))
         if tensor is not None:
@@ -310,15 +315,15 @@ def rotation_of_rpy(roll: float, pitch: float, yaw: float) -> Floats:
 
 
 def _plain(tag: str) -> str:
-    """Return an element's name without the address of its namespace."""
+    """Return the name of an element without its namespace."""
     return tag.rpartition("}")[2]
 
 
 def _in_own_units(joint: UrdfJoint, slides: Mapping[str, bool]) -> UrdfJoint:
-    """Return a joint with the multiplier of its mimic in rad and mm, where the document has rad and m.
+    """Return a joint with the multiplier of its mimic converted from rad and m to rad and mm.
 
     Args:
-        joint: as read.
+        joint: the joint as read.
         slides: name of each joint -> True if it is prismatic.
     """
     mimic, own = joint.mimic, joint.kind == "prismatic"

@@ -99,5 +99,7 @@ def test_false_alarms_are_rarer_than_one_in_ten_thousand_standstills() -> None:
 
 def test_fixes_that_place_no_base_at_an_unknown_set_up_are_refused() -> None:
     rows = observed(TRUE, 1, 5, "never seen")
-    with pytest.raises(UnsafeError, match="the check shots place no base: at set-up 'never seen'"):
+    with pytest.raises(
+        UnsafeError, match="the check shots cannot determine the base transform: at set-up 'never seen'"
+    ):
         check(model(), rows)

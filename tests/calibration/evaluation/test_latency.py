@@ -66,4 +66,4 @@ def test_play_is_not_taken_for_latency() -> None:
 
 def test_a_boom_that_stands_tells_nothing_and_says_what_it_takes() -> None:
     standing = parsed(simulate_observations(STATIC, 40, 21, prisms=["r"], setup="S1"))
-    assert estimate_latency(model(), standing) == "it takes 30 fixes in 5 motions; there are 0 in 0"
+    assert estimate_latency(model(), standing) == "30 fixes in 5 motions are needed; there are 0 in 0"

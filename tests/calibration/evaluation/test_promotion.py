@@ -91,12 +91,12 @@ def test_a_gain_on_too_few_standstills_asks_for_more_check_sessions(session: Ses
 def test_a_first_model_may_go_live_unless_it_is_worse_than_the_nominal_one(session: Session) -> None:
     first = compare_held_out(session.model, None, few(session, 2))
     assert (first.against, first.standstills, first.is_better) == ("nominal", 2, True)
-    assert first.sentence.endswith("mm: enough, as there is no live model to beat")
+    assert first.sentence.endswith("nominal stage: enough, as there is no live model to beat")
     for count in (3, 40):
         spoilt = compare_held_out(worse(session.model, 500.0), None, few(session, count))
         assert not spoilt.is_better
         assert spoilt.sentence.endswith(
-            "larger, in all or at most standstills; more check fixes must show that it is no larger"
+            "larger, overall or at most standstills; more check fixes must show that it is not larger"
         )
 
 
@@ -105,7 +105,7 @@ def test_a_first_model_does_not_go_live_on_one_standstill(session: Session, by_m
     rows = few(session).select(np.zeros(4, dtype=int))
     found = compare_held_out(worse(session.model, by_mm), None, rows)
     assert (found.standstills, found.p, found.is_better) == (1, 1.0, False)
-    assert found.sentence.endswith("more check fixes must show that it is no larger")
+    assert found.sentence.endswith("more check fixes must show that it is not larger")
 
 
 def test_the_probability_that_is_told_is_that_of_the_gain(session: Session) -> None:

@@ -303,7 +303,7 @@ def test_without_sweeps_or_times_the_protocol_does_the_rest_and_says_so() -> Non
     said = " ".join(found.warnings)
     assert "no single-joint sweep" in said
     assert "no time_s" in said
-    assert "40 points and not 200" in said
+    assert "40 points, not 200" in said
 
 
 def test_the_optimum_is_where_no_direction_leads_down() -> None:

@@ -266,7 +266,7 @@ def test_what_c_leaves_out_is_said_with_its_error(session: Session, tmp_path: Pa
     left_out = form.left_out(Export(model, "0" * 64))
     assert left_out.parts == ("leak_down@theta4", "solar_bow@theta4")
     assert "station_scale@station moves fixes or the base" in left_out.not_measured[0]
-    assert any("leak_down@theta4 does is not measured here" in sentence for sentence in left_out.sentences)
+    assert any("without leak_down@theta4 is not measured here" in sentence for sentence in left_out.sentences)
     text = form.content(Export(model, "0" * 64)).decode()
     assert all(sentence in " ".join(text.split()) for sentence in left_out.sentences)
     assert c_error_mm(model, tmp_path) <= EXACT_MM

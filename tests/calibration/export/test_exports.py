@@ -116,7 +116,7 @@ def test_what_the_grid_lacks_counts_in_the_error_that_is_said_of_it(session: Ses
     assert play_mm > 2.0 * without.rms_mm
     assert found.rms_mm == pytest.approx(math.hypot(play_mm, without.rms_mm), rel=0.1)
     (warning,) = (text for text in Export(loose, "", ("r",)).summary["warnings"] if "backlash" in text)
-    assert warning.startswith("corrections.csv has no backlash@theta4, which joint values alone do not tell")
+    assert warning.startswith("corrections.csv leaves out backlash@theta4, which needs more than joint values")
 
 
 def test_nodes_span_what_the_model_was_trained_on_and_joints_that_matter_get_more(session: Session) -> None:
@@ -173,7 +173,7 @@ def test_a_new_format_is_one_new_file(session: Session, tmp_path: Path, monkeypa
     assert {"calibration.json", "corrections.csv", "parameters.txt"} <= files.keys()
     assert files["parameters.txt"].decode().split("\n") == [p.name for p in session.model.parameters]
     assert export_files(Export(session.model, ""), ["parameters-txt"]) == {"parameters.txt": files["parameters.txt"]}
-    with pytest.raises(DataError, match=f"'stl' is unknown; there are {', '.join(formats())}"):
+    with pytest.raises(DataError, match=f"'stl' is unknown; give one of {', '.join(formats())}"):
         export_files(Export(session.model, ""), ["stl"])
     (tmp_path / "parameters_again.py").write_text(PARAMETERS_TXT)
     with pytest.raises(AssertionError, match="two formats are called parameters-txt"):

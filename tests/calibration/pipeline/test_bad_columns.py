@@ -139,5 +139,5 @@ def test_map_coordinates_are_named(session: Session) -> None:
     far = replace(session.training, position_mm=session.training.position_mm + np.array([5e5, 6.7e6, 1e5]))
     assert calibrated(session, far).warnings[0].startswith("the fixes are 6.73 km from the origin")
     farther = replace(far, position_mm=far.position_mm + np.array([0.0, 6.7e9, 0.0]))
-    with pytest.raises(DataError, match="of map coordinates, subtract the instrument's"):
+    with pytest.raises(DataError, match="subtract the instrument's coordinates from map coordinates"):
         parse_observations(format_observations(farther, session.rig).encode(), session.rig, "map.csv")

@@ -244,14 +244,14 @@ def test_no_method_takes_mirrored_coordinates(session: Session, method: str) -> 
 
 @pytest.mark.parametrize("method", ["km", "skcm"])
 def test_least_squares_refuse_what_they_cannot_fit(session: Session, method: str) -> None:
-    with pytest.raises(UnsafeError, match=r"still \d+ mm RMS off, where this rig's build tolerances explain"):
+    with pytest.raises(UnsafeError, match=r"still \d+ mm RMS, but this rig's build tolerances explain"):
         identify(session.rig, rig_text("swdt82"), in_radians(session.training), method=method)
 
 
 def test_the_published_search_says_when_it_has_not_come_to_rest(session: Session) -> None:
     wrong = scaled(theta4=-1.0)(session.training.select(np.arange(60)))
     model = identify(session.rig, rig_text("swdt82"), wrong, method="pde-paper", run=Run(should_stop=lambda: True))
-    assert any("it has not come to rest, or the data are not this rig's" in warning for warning in model.warnings)
+    assert any("the search has not converged, or the data are not of this rig" in warning for warning in model.warnings)
 
 
 def test_warnings_of_the_training_are_told_apart_from_those_of_other_rows(session: Session) -> None:

@@ -80,7 +80,7 @@ def test_time_does_not_run_backwards_while_a_machine_stands() -> None:
     column = header.split(",").index("dwell_s")
     cells = first.split(",")
     cells[column] = "-5.0"
-    with pytest.raises(DataError, match="line 2, column dwell_s: -5 is beyond what it can be"):
+    with pytest.raises(DataError, match="line 2, column dwell_s: -5 is outside the possible range"):
         parse_observations("\n".join([header, ",".join(cells), *rows]).encode(), support.SOURCE.rig, "session.csv")
 
 

@@ -151,7 +151,10 @@ def test_a_search_that_is_told_to_stop_returns_the_best_so_far_and_says_so() -> 
 
 def test_a_population_of_fewer_than_four_is_refused() -> None:
     settings = PaperSettings(population=3)
-    with ThreadPoolExecutor(1) as pool, pytest.raises(ValueError, match="of 3 candidates; at least 1 of 4"):
+    with (
+        ThreadPoolExecutor(1) as pool,
+        pytest.raises(ValueError, match="of 3 candidates; at least 1 search of 4 is needed"),
+    ):
         evolve_paper([sphere], sphere, LOWER, UPPER, run=Run(0, pool), settings=settings)
 
 
@@ -198,7 +201,7 @@ def test_the_objective_names_what_the_data_lack() -> None:
     only_r = np.flatnonzero(paper.data.prism == paper.chain.rig.prism_names.index("r"))
     with pytest.raises(DataError, match="no pose has fixes of both 'r' and 's'"):
         objective(weight={"r": 1.0}).fitness(only_r)
-    with pytest.raises(DataError, match="prism 's' has weight 1 in the objective and no fix"):
+    with pytest.raises(DataError, match="prism 's' has weight 1 in the objective but no fix"):
         paper.fitness(only_r)
     with pytest.raises(DataError, match="no prism 'q'"):
         objective(weight={"q": 1.0}).fitness()

@@ -200,7 +200,7 @@ def test_without_masses_and_without_measured_torques_the_method_is_refused(metho
     _, training, _ = robot(0, ())
     some = np.where(np.arange(len(training)) % 2 == 0, 100.0, np.nan)
     for data in (training, replace(training, extra={"theta2_Nm": some})):
-        with pytest.raises(DataError, match=f"method {method} needs the torques of joints: give rig 'ys100' masses"):
+        with pytest.raises(DataError, match=f"method {method} needs the torques of joints; add masses to rig 'ys100'"):
             require_torques(bare, data, method)
     joints = {j.name: np.linspace(*j.limits, len(training)) for j in rig.joints}
     with pytest.raises(DataError, match="'arm7'"):

@@ -49,5 +49,7 @@ def test_a_decoding_is_another_one_only_where_both_rigs_tell_it(here: Rig, there
 
 
 def test_nobody_is_told_to_write_a_decoding() -> None:
-    with pytest.raises(RigError, match=r"decodings: unknown key; there are name, convention, .*, station \(line 1\)$"):
+    with pytest.raises(
+        RigError, match=r"decodings: unknown key; allowed here: name, convention, .*, station \(line 1\)$"
+    ):
         parse_rig(f"decodings = 1\n{rig_text('swdt82')}", "mine.toml")

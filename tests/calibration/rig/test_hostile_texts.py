@@ -27,13 +27,13 @@ ROW = b"tmac,1,2,3,4,5,6,1000,2000,3000"
     ("text", "reason"),
     [
         ("name = " + "9" * 5000, "not valid TOML: Exceeds the limit"),
-        ("name = 9223372036854775808", "name: a whole number beyond 64 bits"),
-        ("station = { a = [[9223372036854775808]] }", "a: a whole number beyond 64 bits"),
-        ("a." * 100_000 + "b = 1", "line 1: more than 100 points"),
-        ("[" + "a . " * 200 + "b]", "line 1: more than 100 points"),
+        ("name = 9223372036854775808", "name: the whole number does not fit into 64 bits"),
+        ("station = { a = [[9223372036854775808]] }", "a: the whole number does not fit into 64 bits"),
+        ("a." * 100_000 + "b = 1", "line 1: more than 100 dots in its keys"),
+        ("[" + "a . " * 200 + "b]", "line 1: more than 100 dots in its keys"),
         ("a = " + "[" * 100_000, "nested too deeply"),
         ("a = " + "{b=" * 10_000, "nested too deeply"),
-        ("#" * (1 << 20), "it has 1,048,576 characters, 524,288 at most are read"),
+        ("#" * (1 << 20), "the text has 1,048,576 characters; the maximum is 524,288"),
         (rig_text("ur10") + '[[prism]]\nname = "a"\nframe = 1\noffset_mm = [0, 0, 0]\n' * 300, "prism: .* at most 300"),
     ],
 )
@@ -68,21 +68,21 @@ def refused(data: bytes, reason: str) -> None:
     [
         (
             b"\n".join((HEADER, ROW + b"," * (2 << 20))),
-            "line 2: not a CSV file: a row of more than 1,048,576 characters",
+            "line 2: not a CSV file: a row has more than 1,048,576 characters",
         ),
         (b"\n".join((HEADER, b'"' + b"a\n" * (1 << 20))), "not a CSV file: field larger than field limit"),
-        (b"\n".join((HEADER, b'"a\nb",' * 300_000)), "not a CSV file: a row of more than 1,048,576 characters"),
-        (HEADER + b",c" * 1000 + b"\n", "line 1: 1010 columns; at most 1000"),
+        (b"\n".join((HEADER, b'"a\nb",' * 300_000)), "not a CSV file: a row has more than 1,048,576 characters"),
+        (HEADER + b",c" * 1000 + b"\n", "line 1: 1010 columns; the maximum is 1000"),
         (
             b"\n".join((HEADER, ROW.replace(b"1000", b"1" * 10_000))),
             r"line 2, column x_mm: '1{20}'\.\.\. of 10000 char",
         ),
-        (b"\n".join((HEADER, ROW + b"\0")), "line 2: a zero byte"),
+        (b"\n".join((HEADER, ROW + b"\0")), "line 2: contains a zero byte"),
         (b"\n".join((HEADER, ROW, ROW + b"\xff")), "line 3: byte .* is not UTF-8"),
         (b"\n".join((HEADER, ROW, ROW + b"\xff" * 100_000, ROW)), "line 3: byte .* is not UTF-8"),
         (
             b"\n".join((HEADER + b",setup", ROW + b"," + b"a" * 200, *[ROW + b",b"] * 100_000)),
-            "line 2, column setup: a label of 200 characters among 100001 rows; shorten it",
+            "line 2, column setup: the label has 200 characters, too many in a table of 100001 rows; shorten it",
         ),
     ],
 )

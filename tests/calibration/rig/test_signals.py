@@ -45,16 +45,16 @@ def test_the_column_of_a_signal_is_read_and_survives_the_round_trip(name: str, u
     ("name", "unit", "reason"),
     [
         ("tilt", "furlong", "signal.1.unit: must be 'deg'"),
-        ("tilt x", "deg", "signal.1.name: must be letters, digits and _"),
-        ("temperature", "degC", "the column temperature_degC is known without it"),
-        ("theta1_rate", "", "the column theta1_rate is known without it"),
-        ("x_pred", "mm", "the column x_pred_mm is known without it"),
-        ("rod_feed", "mm", "the column rod_feed_mm is known without it"),
-        ("theta1", "V", "signal 'theta1': a joint is called so"),
-        ("L2", "bar", "signal 'L2': a joint is called so; its column is read without it"),
-        ("r", "deg", "signal 'r': a prism is called so"),
-        ("pump", "degC", "signal 'pump': a channel is called so"),
-        ("frame3_x", "mm", "rigcal computes something called frame3_x_mm"),
+        ("tilt x", "deg", "signal.1.name: must consist of letters, digits and _"),
+        ("temperature", "degC", "the column temperature_degC is already defined"),
+        ("theta1_rate", "", "the column theta1_rate is already defined"),
+        ("x_pred", "mm", "the column x_pred_mm is already defined"),
+        ("rod_feed", "mm", "the column rod_feed_mm is already defined"),
+        ("theta1", "V", "signal 'theta1': a joint has the same name"),
+        ("L2", "bar", "signal 'L2': a joint has the same name; remove the signal, as its column is read without it"),
+        ("r", "deg", "signal 'r': a prism has the same name"),
+        ("pump", "degC", "signal 'pump': a channel has the same name"),
+        ("frame3_x", "mm", "rigcal computes a column frame3_x_mm itself"),
     ],
 )
 def test_a_signal_that_something_else_is_called_is_refused(name: str, unit: str, reason: str) -> None:
@@ -76,9 +76,9 @@ def test_a_rig_takes_signals_by_their_columns_as_its_file_would(tmp_path: Path) 
     assert Rig.read(path) == rig
     with pytest.raises(RigError, match="two signals are called 'tilt_x'"):
         rig.with_signals("tilt_x_deg")
-    with pytest.raises(RigError, match=r"'tilt x' cannot be a signal's column: .* as in tilt_x_deg"):
+    with pytest.raises(RigError, match=r"'tilt x' cannot be the column of a signal; .* as in tilt_x_deg"):
         rig.with_signals("tilt x")
-    with pytest.raises(ValueError, match=r"not read from a text, .* use Rig\.read"):
+    with pytest.raises(ValueError, match=r"has no text to .*; read the rig with Rig\.read"):
         Rig.model_validate(rig.model_dump(by_alias=True)).with_signals("tilt_y_deg")
 
 

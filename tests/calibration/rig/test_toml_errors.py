@@ -23,15 +23,15 @@ def told(text: str) -> str:
 @pytest.mark.parametrize(
     ("line", "reason"),
     [
-        ("[[row]]\ndrive = { fo = { q1 = 1 } }", "row.7.drive.fo: is no key here: it must be 'theta', 'd' or 'a'"),
+        ("[[row]]\ndrive = { fo = { q1 = 1 } }", "row.7.drive.fo: is not a valid key: it must be 'theta', 'd' or 'a'"),
         ('[[row]]\na_mm = "x"', "row.7.a_mm: must be a number"),
         ("[[row]]\na_mm = inf", "row.7.a_mm: must be a finite number"),
         ("[[row]]\nafter = -1", "row.7.after: must be 0 or more"),
-        ("[[row]]\nbefore = 3", "row.7.before: must be a table: its keys under a header in square brackets"),
+        ("[[row]]\nbefore = 3", "row.7.before: must be a table, with its keys below a header in square brackets"),
         ("[[row]]\nidentify = 3", "row.7.identify: must be a list, in square brackets"),
         (f"{PRISM}offset_mm = [1, 2, 3, 4]", "offset_mm: must have at most 3"),
         (f"{PRISM}offset_mm = [1, 2, 3]\noffset_known = 3", "offset_known: must be true or false"),
-        ('[[channel]]\nname = "x"', "lacks the key 'device', which says what it is"),
+        ('[[channel]]\nname = "x"', "lacks the key 'device', which selects its kind"),
         (
             '[[channel]]\nname = "t"\ndevice = "cia406_linear"\nnode = 9\nunit = "bar"',
             "channel.1.cia406_linear.unit: must be 'mm'",
@@ -50,5 +50,5 @@ def test_what_a_value_must_be_is_said(line: str, reason: str) -> None:
 @pytest.mark.parametrize("section", ["joint", "row", "prism"])
 def test_a_list_of_tables_is_asked_for_by_its_header(section: str) -> None:
     others = re.sub(rf"(?ms)^\[\[{section}\]\].*?(?=^\[|\Z)", "", TEXT)
-    assert f"{section}: must be tables: [[{section}]] above the keys of each" in told(f'{section} = "x"\n{others}')
-    assert f"{section}: must have at least 1, and has 0" in told(f"{section} = []\n{others}")
+    assert f"{section}: must be tables, each below a header [[{section}]]" in told(f'{section} = "x"\n{others}')
+    assert f"{section}: must have 1 or more entries, but has 0" in told(f"{section} = []\n{others}")

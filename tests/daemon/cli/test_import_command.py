@@ -315,7 +315,10 @@ def test_joints_that_do_not_fit_are_refused(tmp_path: Path, change: tuple[str, s
     [
         ('length_unit = "furlong"', "map.toml: length_unit: must be"),
         (f"first_line = {'9' * 5000}", "map.toml: is not a TOML file: Exceeds the limit"),
-        (f"header_line = 0x{'F' * 5000}", "map.toml: is not a TOML file: header_line: a whole number beyond 64 bits"),
+        (
+            f"header_line = 0x{'F' * 5000}",
+            "map.toml: is not a TOML file: header_line: the whole number does not fit into 64 bits",
+        ),
     ],
 )
 def test_a_wrong_map_is_refused(tmp_path: Path, line: str, said: str) -> None:

@@ -84,7 +84,7 @@ def test_a_grid_too_coarse_to_mend_much_is_exported_with_a_warning(tmp_path: Pat
     grid = told["leaves_out"]["corrections.csv"]
     assert grid["rms_mm"] > 0.1 * grid["correction_rms_mm"]
     assert [text.partition(" mm RMS")[0] for text in told["warnings"]] == [
-        f"between the nodes of corrections.csv, interpolated corrections are wrong by {grid['rms_mm']:.2g}"
+        f"between the nodes of corrections.csv, interpolated corrections have an error of {grid['rms_mm']:.2g}"
     ]
     assert f"Warning: {told['warnings'][0]}" in CliRunner().invoke(main, command).stderr
 

@@ -126,7 +126,7 @@ def test_an_import_does_not_overwrite_a_rig_file(tmp_path: Path) -> None:
         (("rig", "import", "{urdf}", "--convention", "dh", "--out", "o"), "is for a table"),
         (("rig", "export", "ur10", "--out", "o.stl"), "ends in one of"),
         (("rig", "check", "nowhere.toml"), "nowhere.toml: there is no such file"),
-        (("rig", "check", "./nowhere"), "./nowhere: there is no such file; name one that there is, or a shipped rig ("),
+        (("rig", "check", "./nowhere"), "./nowhere: there is no such file; give another path, or a shipped rig ("),
         (("rig", "check", "nowhere"), "nowhere: neither a shipped rig"),
         (("run", "--rig", "ur10"), "--rig and --by-hand are for a simulated rig"),
         (("simulate", "--rig", "ur10", "--poses", "3", "--effect", "nix@q1", "--out", "o"), "unknown effect"),

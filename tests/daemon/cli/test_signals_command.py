@@ -17,7 +17,7 @@ from tests.daemon.support.offline import held_out_csv, train_csv
 
 MM_PER_DEG = 0.8
 SAID = (
-    "column 'tilt_x_deg' holds numbers and is not used; to use it, add --signal tilt_x_deg, or to the rig file the "
+    "column 'tilt_x_deg' holds numbers but is not used; to use it, add --signal tilt_x_deg, or add to the rig file the "
     'three lines [[signal]], name = "tilt_x" and unit = "deg"'
 )
 
@@ -98,8 +98,8 @@ def test_gap_finds_that_the_error_goes_with_the_signal(work: Path) -> None:
     ("signal", "reason"),
     [
         ("tilt_y_deg", "train.csv, column tilt_y_deg: the file has no such column, which --signal names"),
-        ("tilt x", "'tilt x' cannot be a signal's column"),
-        ("temperature_degC", "the column temperature_degC is known without it; leave it out"),
+        ("tilt x", "'tilt x' cannot be the column of a signal"),
+        ("temperature_degC", "the column temperature_degC is already defined; remove the signal"),
     ],
 )
 @pytest.mark.parametrize("command", ["calibrate", "gap", "compare"])

@@ -128,9 +128,9 @@ def test_neither_is_true_a_number_nor_an_empty_text_a_directory(tmp_path: Path, 
 @pytest.mark.parametrize(
     ("text", "told"),
     [
-        ('can = "x"', "can: must be tables: [[can]] above the keys of each, found 'x'"),
-        ("can = [5]", "can.1: must be a table: its keys under a header in square brackets, or in braces, found 5"),
-        ("tip = 5", "tip: must be a table: its keys under a header in square brackets, or in braces, found 5"),
+        ('can = "x"', "can: must be tables, each below a header [[can]], found 'x'"),
+        ("can = [5]", "can.1: must be a table, with its keys below a header in square brackets or in braces, found 5"),
+        ("tip = 5", "tip: must be a table, with its keys below a header in square brackets or in braces, found 5"),
         ("read_group = 5", "read_group: must be a text in quotes, found 5"),
         ("read_group = 2026-01-02", "read_group: must be a text in quotes, found 2026-01-02"),
         ("read_group = {}", "read_group: must be a text in quotes"),

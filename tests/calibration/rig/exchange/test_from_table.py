@@ -60,19 +60,19 @@ def test_a_row_may_be_driven_by_a_sum() -> None:
 @pytest.mark.parametrize(
     ("text", "reason"),
     [
-        ("", "it is empty"),
+        ("", "the file is empty"),
         ("joint,a_mm\n", "no rows"),
         ("joint,a_inch\nq1,1\n", r"header: unknown column 'a_inch'.*\(line 1\)"),
         ("joint,a_mm\nq1,one\n", r"a_mm: 'one' is not a number \(line 2\)"),
-        ("joint,a_mm\nq1,1,2\n", "3 cells, the header has 2"),
+        ("joint,a_mm\nq1,1,2\n", "3 cells, but the header has 2"),
         ("joint,kind\nq1,screw\n", "neither revolute nor prismatic"),
-        ("joint,theta_drive\nq1,q1 q2\n", "no sum such as"),
-        ("joint,a_mm,theta_drive,lower\nq1,9,,\n,,,-90\n", r"names no joint that they are of \(line 3\)"),
-        ("joint,theta_drive\nq1,0.5.5*q1\n", "no sum such as"),
+        ("joint,theta_drive\nq1,q1 q2\n", "not a sum such as"),
+        ("joint,a_mm,theta_drive,lower\nq1,9,,\n,,,-90\n", r"joint: empty; name the joint that .* \(line 3\)"),
+        ("joint,theta_drive\nq1,0.5.5*q1\n", "not a sum such as"),
         ("a_mm\n1\n", "no row names a joint"),
         ("joint;a_mm\nq1;1,5\n", "separate columns by commas"),
-        ("joint,lower,upper\nq1,-9,9\nq1,-9,8\n", r"upper: joint 'q1' has 9 on a line before.*\(line 3\)"),
-        ("# convention: craig\njoint,a_mm\nq1,1\n", "'craig' is none of"),
+        ("joint,lower,upper\nq1,-9,9\nq1,-9,8\n", r"upper: joint 'q1' has 9 on an earlier line.*\(line 3\)"),
+        ("# convention: craig\njoint,a_mm\nq1,1\n", "'craig' is unknown; give one of"),
     ],
 )
 def test_a_table_that_is_none_is_refused_with_line_and_column(text: str, reason: str) -> None:
