@@ -1,5 +1,5 @@
-"""Bytes in, readings out: knows devices, knows nothing of the daemon or of the mathematics.
+"""Device drivers: bytes in, readings out. They depend neither on the daemon nor on the calibration mathematics.
 
 Every driver has two halves: a pure decoder (captured bytes -> records of `drivers.readings`) and a thin loop that
-owns one port, stamps what it reads and hands it on as it came.
+owns one port, timestamps what it reads and passes it on unchanged.
 """

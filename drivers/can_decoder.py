@@ -1,4 +1,4 @@
-"""Decoder of a CAN link: captures to readings, events and gaps. Pure: owns no port, no thread and no clock."""
+"""Decoder of a CAN link: captures to readings, events and gaps. Pure: it owns no port, no thread and no clock."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from drivers.clock import NS_PER_S, Stamp
 from drivers.readings import CanCapture, Capture, DeviceEvent, Gap, GapReason, Record
 
 IDS_MAX = 512
-"""Identifiers that are counted one by one; noise on a 29-bit bus must fill neither memory nor an operator's screen."""
+"""Limit of identifiers counted one by one, so that noise on a 29-bit bus fills neither memory nor the screen."""
 
 _EXTENDED = 1 << 31
 
@@ -29,17 +29,17 @@ _SERVICE_NAMES = {
 
 
 class CanDecoder:
-    """The decoder of one link. `summary` may be called from any thread, everything else from one.
+    """The decoder of one link. `summary` may be called from any thread, all other methods from a single thread.
 
     Args:
         link: name of the link.
-        channels: decoders of its channels. Nodes of CANopen channels are supervised (see NodeSupervision).
+        channels: decoders of its channels. The nodes of CANopen channels are supervised (see NodeSupervision).
     """
 
     def __init__(self, link: str, channels: Iterable[ChannelDecoder]) -> None:
         self._link = link
         self._entries: dict[int, _Entry] = {}
-        self._lock = threading.Lock()  # held where `_entries` grows, where `_rates` changes, and where both are copied
+        self._lock = threading.Lock()  # held while `_entries` grows, `_rates` changes, or either is copied
         self._rates = RateWindow()
         self._unlisted = _Entry()
         self._channels: list[_ChannelState] = []
@@ -62,13 +62,13 @@ class CanDecoder:
                 self._entry(arbitration_id, False).handler = handler
 
     def recall(self, events: Iterable[DeviceEvent]) -> list[DeviceEvent]:
-        """Take on what devices told before this decoder was made.
+        """Restore the state of nodes from events that were recorded before this decoder was created.
 
         Args:
-            events: of any devices, the last of each kind, oldest first.
+            events: events of any devices, the last of each kind, oldest first.
 
         Returns:
-            Those of the link's nodes that tell something, each under the name that its node has now.
+            The events that changed the state of one of the link's nodes, each under the node's current name.
         """
         own = {channel.name for channel in self._channels}
         mine = [event for event in events if event.device in own]
@@ -84,7 +84,7 @@ class CanDecoder:
             return self._bus_errors.feed(stamp, capture.arbitration_id, capture.data)
         key = capture.arbitration_id
         if key == SYNC_ID and not capture.is_extended:
-            self._sync = stamp  # rigcal's own as well: it is an instant, not a reading
+            self._sync = stamp  # including rigcal's own SYNC: it marks an instant and is not a reading
         if capture.is_transmitted:
             return ()
         if capture.is_extended:
@@ -117,7 +117,7 @@ class CanDecoder:
         return records
 
     def summary(self, now: Stamp) -> CanSummary:
-        """Return the counts until `now`, with channels that were never heard."""
+        """Return the counts until `now`, including channels that were never received."""
         with self._lock:
             entries = sorted(self._entries.items())
             rates = self._rates.rates_per_s()
@@ -164,7 +164,7 @@ class _Entry:
 
     def summary(self, key: int, rate_per_s: float | None, now: Stamp) -> IdSummary:
         last_seen = self.last_seen
-        # Channels of one message read the same counter; one that was silent for longer knows of fewer
+        # Channels of one message read the same counter; a channel that was silent for longer has counted fewer losses
         missed = [count for channel in self.channels if (count := channel.missed_frames) is not None]
         return IdSummary(
             arbitration_id=key & ~_EXTENDED,
@@ -188,7 +188,7 @@ class _Entry:
 
 
 class _ChannelState:
-    """One channel: its silence, and the SYNC that its next frame belongs to."""
+    """State of one channel: whether it is silent, and the SYNC that its next frame belongs to."""
 
     __slots__ = ("_decoder", "_is_silent", "_sampling", "_timeout_ns", "last_seen", "name")
 

@@ -1,4 +1,4 @@
-"""The CAN link: one loop that owns one bus, stamps every frame as it arrives and hands it on undecoded."""
+"""The CAN link: one loop that owns one bus, timestamps every frame on arrival and passes it on undecoded."""
 
 from __future__ import annotations
 
@@ -23,24 +23,24 @@ from drivers.outage import Backoff, Outage
 from drivers.readings import CanCapture, Capture, DeviceEvent, EventKind, Gap, GapReason
 from drivers.stall_detector import CLOCK_WAS_SET, NOT_READ_IN_TIME, LateReport, StallDetector
 
-POLL_S = 0.05  # how long a stop or a set-up request may go unnoticed
+POLL_S = 0.05  # longest delay until a stop or a set-up request is noticed
 LOSS_CHECK_NS = NS_PER_S
 
 Emit = Callable[[Capture | DeviceEvent | Gap], None]
 
 
 class CanLink:
-    """Owns one CAN bus: receives, survives its loss, and sends only what the configuration allows (default: nothing).
+    """Owns one CAN bus: receives, reopens it after a loss, and sends only what is configured (default: nothing).
 
     Args:
         config: see CanLinkConfig.
-        clock: stamps the frames and paces SYNC and repetitions.
-        setups: of the nodes that `request_setup` can set up.
-        configure_at_start: set all of them up when the bus is opened for the first time, and only then. For simulated
-            machines, which are always parked; on a real one an operator has to say so each time.
+        clock: timestamps the frames and times SYNC and retries.
+        setups: set-ups of the nodes that `request_setup` can set up.
+        configure_at_start: set up all of these nodes when the bus is opened for the first time, and only then. This is
+            for simulated machines, which are always parked; on a real machine an operator must request each set-up.
 
     Raises:
-        TransmitForbiddenError: SYNC, own identifiers or a set-up at the start are asked for where not allowed.
+        TransmitForbiddenError: SYNC, own identifiers or a set-up at the start are configured but not allowed.
     """
 
     def __init__(
@@ -54,7 +54,7 @@ class CanLink:
         self.name = config.name
         self._config = config
         self._clock = clock
-        self._session: _Session | None = None  # the last one; none once its bus is lost
+        self._session: _Session | None = None  # the latest session; None once its bus is lost
         self._permission = TransmitPermission(
             config.name, config.allow_transmit, config.transmit_nodes, config.own_identifiers
         )
@@ -65,7 +65,7 @@ class CanLink:
                 raise ValueError(f"{config.name}: sync_period_ms must be positive, got {config.sync_period_ms}")
         self._setups = {setup.node: setup for setup in setups}
         self._requests_lock = threading.Lock()
-        self._requests: list[NodeSetup] | None = None  # set-ups that were asked for; None while the bus is closed
+        self._requests: list[NodeSetup] | None = None  # requested set-ups; None while the bus is closed
         self._last_frame = clock.now()
         self._at_start: list[NodeSetup] = []
         if configure_at_start and self._setups:
@@ -81,22 +81,22 @@ class CanLink:
         return bool(self._setups)
 
     def check_setup(self, nodes: Iterable[int] | None = None) -> None:
-        """Raise what `request_setup` would raise now, and do nothing else."""
+        """Raise the error that `request_setup` would raise now, without requesting anything."""
         self._wanted(nodes)
 
     def request_setup(self, nodes: Iterable[int] | None = None) -> None:
         """Ask the running loop to identify, check, configure and start nodes; may be called from any thread.
 
-        The outcome is told by DeviceEvents: CONFIGURED, WARNING, ALARM. The caller has made sure that the machine is
-        parked now. A request therefore never waits for the bus to be opened, and what is not done when the bus is lost
-        is given up, with an ALARM for each node.
+        DeviceEvents report the result: CONFIGURED, WARNING, ALARM. The caller has made sure that the machine is parked
+        now. A request therefore never waits for the bus to be opened, and set-ups that are unfinished when the bus is
+        lost are cancelled, with an ALARM for each node.
 
         Args:
-            nodes: node numbers; None: all that the link knows.
+            nodes: node numbers; None for all nodes that the link can set up.
 
         Raises:
-            TransmitForbiddenError: the link is listen-only, or a node is not listed. Nothing is sent to any node then.
-            DeviceError: no set-up is known for a node, or the bus is not open. Nothing is queued then.
+            TransmitForbiddenError: the link is listen-only, or a node is not listed. Nothing is sent to any node.
+            DeviceError: no set-up is known for a node, or the bus is not open. Nothing is queued.
         """
         wanted = self._wanted(nodes)
         with self._requests_lock:
@@ -107,10 +107,11 @@ class CanLink:
     def publish(self, frames: Sequence[Frame]) -> None:
         """Send rigcal's own frames at the next opportunity; may be called from any thread.
 
-        Only the frames of the newest call wait, and not beyond the opening of the bus: what is old is never sent.
+        Only the frames of the newest call are kept, and they are discarded when the bus is opened, so that outdated
+        frames are never sent.
 
         Raises:
-            TransmitForbiddenError: the link is listen-only, or an identifier is none of its own. Nothing is sent then.
+            TransmitForbiddenError: the link is listen-only, or an identifier is not one of its own. Nothing is sent.
         """
         for frame in frames:
             self._permission.check(frame)
@@ -127,18 +128,18 @@ class CanLink:
         wanted = []
         for node in nodes:
             if node not in self._setups:
-                raise DeviceError(self.name, f"no channel of the rig file is on node {node}")
+                raise DeviceError(self.name, f"the rig file has no channel on node {node}")
             self._permission.check_node(node)
             wanted.append(self._setups[node])
         return wanted
 
     def _not_open(self) -> DeviceError:
-        return DeviceError(self.name, "nothing can be set up: the link is not open; ask again when it is up")
+        return DeviceError(self.name, "nodes cannot be set up while the link is not open; try again when it is up")
 
     def run(self, emit: Emit, stop: threading.Event) -> None:
-        """Receive until `stop` is set, opening the bus again whenever it is lost.
+        """Receive until `stop` is set; open the bus again whenever it is lost.
 
-        What waits to be read by then is still read (`LastReads`), and nothing more is sent.
+        After `stop`, frames that are already waiting are still read (`LastReads`), and nothing more is sent.
         """
         backoff = Backoff()
         outage = Outage(self.name, emit)
@@ -151,15 +152,15 @@ class CanLink:
                     outage.begin(str(error), self._clock.now(), self._last_frame)
                     self._session = None
                     wait_s = backoff.next_s()
-                    # Of real seconds, for devices are plugged in by people; fewer where time is made to run faster
+                    # Real seconds, as people plug in devices; fewer if the clock runs faster than real time
                     watch.wait(stop, min(wait_s, self._clock.real_seconds(wait_s)))
 
     def _serve(self, emit: Emit, stop: threading.Event, outage: Outage, backoff: Backoff, watch: DeviceWatch) -> None:
-        """Receive from the opening of the bus to `stop` or a LinkError."""
+        """Open the bus and receive until `stop` is set or a LinkError is raised."""
         opened = self._clock.host.now()
         with contextlib.closing(open_port(self._config)) as port:
             session = _Session(self._config, self._clock, self._permission, port, emit, opened)
-            # An interface that is down opens all the same, and fails at the first read
+            # An interface that is down can be opened, but the first read fails
             read = session.first_read()
             watch.close()
             at_start, self._at_start = self._at_start, []
@@ -186,7 +187,7 @@ class CanLink:
                 self._last_frame = session.last_frame
 
     def _swap_requests(self, requests: list[NodeSetup] | None) -> list[NodeSetup]:
-        """Return the set-ups that were asked for, and put `requests` in their place."""
+        """Replace the requested set-ups by `requests` and return the previous ones."""
         with self._requests_lock:
             waiting, self._requests = self._requests, requests
         return waiting or []
@@ -199,7 +200,7 @@ class CanLink:
 
 
 def _watch(config: CanLinkConfig) -> DeviceWatch:
-    """Return the watch that tells that the link's device is back."""
+    """Return the watch that notices when the link's device is back."""
     if config.interface == "socketcan":
         return watch_interface(config.channel)
     if config.interface == "slcan":
@@ -217,7 +218,7 @@ class _Read:
 
 
 class _Session:
-    """One life of the bus, from its opening to its loss or a stop."""
+    """The time from opening the bus to its loss or a stop."""
 
     def __init__(
         self,
@@ -238,12 +239,13 @@ class _Session:
         self._stamps = ReceiveStamps(clock, opened)
         began = clock.of_host(opened)
         self._stalls = StallDetector(clock, began)
-        self.read_until = self._emptied = began  # when the port was last found empty: with its losses told, and at all
-        self._sent: deque[CanCapture] = deque()  # what was received before it may still have to be read
+        # When the port was last found empty; `read_until` lags behind until the losses up to then are reported
+        self.read_until = self._emptied = began
+        self._sent: deque[CanCapture] = deque()  # held back: frames received earlier may still have to be read
         now = clock.now()
         self._late = LateReport(config.name, "frames", began)
         self._check_losses_ns = now.monotonic_ns + LOSS_CHECK_NS
-        self._checked = self._heard_then = now  # when losses were last looked for, and the last frame before that
+        self._checked = self._heard_then = now  # time of the last check for losses, and the last frame before it
         self._sync: SyncProducer | None = None
         if config.sync_period_ms is not None:
             period_ns = round(config.sync_period_ms * 1e6)
@@ -251,7 +253,7 @@ class _Session:
 
     @property
     def last_frame(self) -> Stamp:
-        """Stamp of the last frame; of the opening of the bus if there was none."""
+        """Stamp of the last frame; if there was none, of the opening of the bus."""
         return self._stamps.latest
 
     def read(self, timeout_s: float) -> _Read:
@@ -269,7 +271,7 @@ class _Session:
         return read
 
     def take(self, read: _Read) -> None:
-        """Stamp and emit the frames of a read; those that may have waited, not stamped before, are marked."""
+        """Timestamp and emit the frames of a read; mark as doubtful those that may have waited without a timestamp."""
         now = self._clock.of_host(read.ended)
         is_late = self._stalls.is_late(now, POLL_S)
         stamps = self._stamps.of(read.batch, read.began, read.ended, is_late=is_late)
@@ -295,15 +297,15 @@ class _Session:
             self._emptied = began
 
     def _emit_sent(self, until: Stamp) -> None:
-        """Emit the frames sent until then; those still to be read were received later."""
+        """Emit the frames that were sent up to `until`; all frames still unread were received later."""
         while self._sent and self._sent[0].stamp.monotonic_ns <= until.monotonic_ns:
             self._emit(self._sent.popleft())
 
     def serve(self, requests: Iterable[NodeSetup], published: Iterable[Frame]) -> None:
-        """Send all frames that are due; report lost ones.
+        """Send all frames that are due, and report lost frames.
 
         Args:
-            requests: set-ups that were asked for since the last call.
+            requests: set-ups requested since the last call.
             published: own frames to send.
         """
         monotonic_ns = self._clock.monotonic_ns()
@@ -317,7 +319,7 @@ class _Session:
             self._setup.add(request)
         if self._setup.is_active:
             self._setup.advance(self._clock.now())
-        # The last node's start and its event are left when it is done
+        # Even if no set-up is active any more, the last node's start command and event may be left to send
         for frame in self._setup.take_frames():
             self._send(frame)
         self._emit_setup_events()
@@ -336,7 +338,7 @@ class _Session:
         return patience_s
 
     def close(self, requests: Iterable[NodeSetup], cause: str) -> None:
-        """Report all that is left when the bus is given up because of `cause`."""
+        """Report everything that is left when the bus is closed because of `cause`; cancel set-ups."""
         self._emit_sent(self._clock.now())
         self._report_losses()
         self.read_until = self._emptied
@@ -364,10 +366,10 @@ class _Session:
             lost = total - self._losses.get(reason, 0)
             if lost > 0:
                 missed += lost
-                text = f"{self._name}: {lost} frames lost, {reason}"
+                text = f"{self._name}: {lost} frames lost: {reason}"
                 self._emit(DeviceEvent(self._name, now, EventKind.FRAMES_DROPPED, text, lost))
                 if reason == OVERFLOW:
-                    # Told only with the next frame that finds room, so it may lie as far back as the frame before
+                    # Reported only with the next frame that fits, so the loss may go back to the frame before the check
                     start = self._heard_then
         if missed:
             self._emit(Gap(self._name, GapReason.FRAMES_LOST, start, now, missed))

@@ -1,4 +1,4 @@
-"""Clocks and stamps: every record carries three clocks, liveness uses the monotonic one alone."""
+"""Clocks and stamps. Every record has a stamp on three clocks; timeouts use only the monotonic clock."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Protocol
 
 NS_PER_S = 1_000_000_000
 
-_TIGHT_NS = 20_000  # three readings of clocks within this were not interrupted; they take a tenth of it
+_TIGHT_NS = 20_000  # three clock readings within this time were not interrupted; they normally take a tenth of it
 _READINGS = 8
 
 
@@ -22,8 +22,8 @@ class Stamp:
     Attributes:
         utc_ns: nanoseconds since 1970-01-01 UTC; may step when the host's clock is set.
         monotonic_ns: nanoseconds of the host's monotonic clock; never steps, restarts at boot.
-        boot_id: which boot `monotonic_ns` belongs to.
-        is_doubtful: what is stamped may have happened long before or after; nothing may rely on its time.
+        boot_id: identifier of the boot that `monotonic_ns` belongs to.
+        is_doubtful: the real time may be much earlier or later, so nothing may rely on it.
     """
 
     utc_ns: int
@@ -40,19 +40,26 @@ class Stamp:
         return replace(self, is_doubtful=True)
 
     def since(self, earlier: Stamp) -> int:
-        """Return the nanoseconds since `earlier`: monotonic within one boot, UTC from one boot to another."""
+        """Return the nanoseconds since `earlier`: on the monotonic clock within one boot, else on UTC."""
         if self.boot_id == earlier.boot_id:
             return self.monotonic_ns - earlier.monotonic_ns
         return self.utc_ns - earlier.utc_ns
 
 
 Order = Callable[[Stamp], tuple[int, int]]
-"""Order of instants: the boot that an instant belongs to, and its place in it. UTC cannot tell, for a boot
-may show an earlier time than the one before it."""
+"""Sort key of instants: number of the boot, and position within it. UTC cannot be used, as a boot may show an earlier
+time than the boot before it."""
 
 
 def lies_within(order: Order, stamp: Stamp, since: Stamp | None, until: Stamp | None) -> bool:
-    """Return True if `stamp` lies between two instants, the first included; None is no bound."""
+    """Return True if `stamp` is at or after `since` and before `until`.
+
+    Args:
+        order: sort key of instants.
+        stamp: instant to check.
+        since: start, included; None for no start.
+        until: end, excluded; None for no end.
+    """
     at = order(stamp)
     return (since is None or at >= order(since)) and (until is None or at < order(until))
 
@@ -61,30 +68,30 @@ class Clock(Protocol):
     """A clock, passed to whatever needs time."""
 
     def now(self) -> Stamp:
-        """Return this instant on all three clocks."""
+        """Return the current time on all three clocks."""
 
     def monotonic_ns(self) -> int:
-        """Return the monotonic clock alone, for deadlines."""
+        """Return the monotonic clock only, for deadlines."""
 
     def sleep(self, seconds: float) -> None:
         """Let `seconds` of this clock pass."""
 
     def wait(self, event: threading.Event, seconds: float) -> bool:
-        """Wait for `event` for at most `seconds` of this clock; True when it is set."""
+        """Wait for `event` for at most `seconds` of this clock; return True if it is set."""
 
     def real_seconds(self, seconds: float) -> float:
-        """Convert seconds of this clock to real ones, as operating-system calls take them."""
+        """Convert seconds of this clock to real seconds, for operating-system calls."""
 
     @property
     def host(self) -> Clock:
-        """The host's own clocks, by which the kernel stamps what it receives."""
+        """The host's own clocks, with which the kernel timestamps received data."""
 
     def of_host(self, stamp: Stamp) -> Stamp:
         """Convert an instant of the host's clocks to this clock's."""
 
 
 def read_boot_id() -> str:
-    """Return the kernel's boot identifier (Linux, random(4)); "unknown" where there is none."""
+    """Return the kernel's boot identifier (Linux, random(4)); "unknown" if there is none."""
     try:
         return Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
     except OSError:
@@ -95,7 +102,7 @@ class SystemClock:
     """The host's clocks.
 
     Args:
-        utc_ns, monotonic_ns: read them.
+        utc_ns, monotonic_ns: functions that read the two clocks.
     """
 
     def __init__(
@@ -106,11 +113,11 @@ class SystemClock:
         self._boot_id = read_boot_id()
 
     def now(self) -> Stamp:
-        """Return this instant on all three clocks.
+        """Return the current time on all three clocks.
 
-        A thread can be interrupted between the readings of two clocks, for as long as the computer is busy. UTC is
-        therefore read between two readings of the monotonic clock, and again if they lie apart; of several the tightest
-        counts.
+        A thread can be interrupted between reading two clocks, for as long as the computer is busy. UTC is therefore
+        read between two readings of the monotonic clock. If these lie too far apart, the readings are repeated, and the
+        closest pair is used.
         """
         tightest_ns, ahead_ns = 1 << 63, 0
         after_ns = self._monotonic_ns()
@@ -143,14 +150,14 @@ class SystemClock:
 
 
 class ScaledClock:
-    """A clock that shows `origin` at one instant and runs `rate` times as fast as the host's from then on.
+    """A clock that shows `origin` at one instant and runs `rate` times as fast as the host's clock.
 
-    Simulated processes share it by sharing rate and origin.
+    Simulated processes that use the same rate and origin have the same clock.
 
     Args:
         rate: seconds of this clock per real second, > 0.
-        origin: what it shows when the host's monotonic clock shows `real_origin_ns`.
-        real_origin_ns: when that is; when both clocks show the same by default.
+        origin: time of this clock when the host's monotonic clock shows `real_origin_ns`.
+        real_origin_ns: instant of the origin on the host's monotonic clock; None for `origin.monotonic_ns`.
     """
 
     def __init__(self, rate: float, origin: Stamp, real_origin_ns: int | None = None) -> None:
@@ -189,10 +196,10 @@ class ScaledClock:
 
 
 class ManualClock:
-    """A clock that only moves when told to: tests, replay as fast as it goes, and simulators without a port.
+    """A clock that moves only on request: for tests, replay at full speed, and simulators without a port.
 
     Args:
-        start: its first instant.
+        start: initial time.
     """
 
     def __init__(self, start: Stamp = Stamp(1_700_000_000 * NS_PER_S, NS_PER_S, "manual")) -> None:
@@ -207,12 +214,12 @@ class ManualClock:
         return self._now.monotonic_ns
 
     def advance(self, seconds: float) -> None:
-        """Move on by `seconds`."""
+        """Move forward by `seconds`."""
         with self._lock:
             self._now = self._now.shifted(round(seconds * NS_PER_S))
 
     def set(self, stamp: Stamp) -> None:
-        """Jump to `stamp` (a captured record's instant)."""
+        """Set the clock to `stamp` (the instant of a captured record)."""
         with self._lock:
             self._now = stamp
 
@@ -236,10 +243,10 @@ class ManualClock:
 
 
 class TimeBudget:
-    """A time-out in real time that several steps share, whatever the rig's clock does; it runs from now on.
+    """A timeout in real time that several steps share, independent of the rig's clock; it starts on creation.
 
     Args:
-        seconds: how long it lasts.
+        seconds: duration.
     """
 
     def __init__(self, seconds: float) -> None:
@@ -248,10 +255,10 @@ class TimeBudget:
 
     @property
     def left_s(self) -> float:
-        """Seconds left, never negative: the time-out to give to a join or a wait."""
+        """Seconds left, never negative; use this as the timeout of a join or wait."""
         return max(self._ends_ns - self._clock.monotonic_ns(), 0) / NS_PER_S
 
     @property
     def is_over(self) -> bool:
-        """True when nothing is left."""
+        """True when no time is left."""
         return self.left_s == 0.0

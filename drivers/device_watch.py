@@ -1,7 +1,8 @@
-"""Waiting for a device to come back: told by the kernel where it can tell, with a longest wait where it cannot.
+"""Waiting for a device to come back: notified by the kernel where possible, with a maximum wait otherwise.
 
-The entry of a serial device appears in its directory, and udev's link to it beside it (inotify(7)); a network interface
-comes up (rtnetlink(7)). Both are asked for here with the C library and a socket, which need no further dependency.
+The file of a serial device and udev's symbolic links to it appear in their directories (inotify(7)); a network
+interface comes up (rtnetlink(7)). Both are watched here with the C library and a socket, so that no further dependency
+is needed.
 """
 
 from __future__ import annotations
@@ -16,9 +17,9 @@ import threading
 import time
 from collections.abc import Iterator
 
-STOP_POLL_S = 0.05  # how long a stop may go unnoticed
-SETTLE_S = 0.2  # from the first sign of a device to the attempt: udev sets its owner and makes its links meanwhile
-_LINKS_MAX = 16  # symbolic links in a row that are followed
+STOP_POLL_S = 0.05  # longest delay until a stop is noticed
+SETTLE_S = 0.2  # from the first sign of a device to the attempt to open it: udev sets its owner and creates its links
+_LINKS_MAX = 16  # longest chain of symbolic links that is followed
 
 # Linux, include/uapi/linux/inotify.h
 _IN_ATTRIB, _IN_MOVED_TO, _IN_CREATE, _IN_DELETE_SELF, _IN_MOVE_SELF = 0x004, 0x080, 0x100, 0x400, 0x800
@@ -42,27 +43,27 @@ _libc = ctypes.CDLL(None, use_errno=True)
 class DeviceWatch:
     """Waits for a device that may come back; see `watch_path` and `watch_interface`.
 
-    It watches from the first `wait` until `close`, so that nothing is missed between two attempts to open the device.
-    What happens before the first wait is found by the attempt after it, so that one is short. One thread uses a watch.
+    The watch is active from the first `wait` until `close`, so that nothing is missed between two attempts to open the
+    device. The first wait is short, because the device may have come back before it. Use a watch from one thread only.
     """
 
     def __init__(self) -> None:
         self._descriptor: int | None = None
 
     def wait(self, stop: threading.Event, timeout_s: float) -> bool:
-        """Wait until the device may be back; never longer than `timeout_s`, as not everything shows.
+        """Wait until the device may be back, for at most `timeout_s`, as the kernel does not report everything.
 
         Args:
-            stop: ends the wait.
-            timeout_s: real seconds, whatever clock the link has: devices are plugged in by people.
+            stop: event that ends the wait.
+            timeout_s: real seconds, regardless of the link's clock, because people plug in devices.
 
         Returns:
-            True if something happened to the device; False when the time was up, or `stop` was set.
+            True if something happened to the device; False after the timeout or if `stop` was set.
         """
         if self._descriptor is None:
-            with contextlib.suppress(OSError):  # no descriptors left, or the kernel has no such thing: time must do
+            with contextlib.suppress(OSError):  # no descriptors left, or no kernel support: only the timeout remains
                 self._descriptor = self._open()
-                timeout_s = min(timeout_s, SETTLE_S)  # it may have come back before it was watched
+                timeout_s = min(timeout_s, SETTLE_S)  # it may have come back before the watch began
         self._renew()
         deadline = time.monotonic() + timeout_s
         while not stop.is_set() and (left_s := deadline - time.monotonic()) > 0:
@@ -75,7 +76,7 @@ class DeviceWatch:
         return False
 
     def close(self) -> None:
-        """Watch no longer, until the next `wait`. Never raises."""
+        """Stop watching until the next `wait`. Never raises."""
         if self._descriptor is not None:
             with contextlib.suppress(OSError):
                 os.close(self._descriptor)
@@ -88,7 +89,7 @@ class DeviceWatch:
         return bool(poll.poll(timeout_s * 1000))
 
     def _has_news(self) -> bool:
-        """Read all messages of the kernel; return True if any is about the device."""
+        """Read all messages from the kernel; return True if any concerns the device."""
         assert self._descriptor is not None
         news = False
         while True:
@@ -96,24 +97,24 @@ class DeviceWatch:
                 message = os.read(self._descriptor, 1 << 16)
             except BlockingIOError:
                 return news
-            except OSError:  # more happened than the kernel could hold
+            except OSError:  # the kernel's message buffer overflowed
                 return True
             news = self._is_news(message) or news
 
     def _open(self) -> int:
-        """Open a non-blocking descriptor on which the kernel sends its messages."""
+        """Open a non-blocking descriptor that receives the kernel's messages."""
         raise OSError("nothing to watch")
 
     def _renew(self) -> None:
-        """Watch again those places that have changed."""
+        """Update the watched places after a change."""
 
     def _is_news(self, message: bytes) -> bool:
-        """Return True if a message of the kernel is about the device."""
+        """Return True if a message from the kernel concerns the device."""
         raise NotImplementedError(message)
 
 
 def watch_path(path: str) -> DeviceWatch:
-    """Watch for a device's path, its symbolic links and its missing directories included, to appear."""
+    """Watch for a device's path to appear, including its symbolic links and missing directories."""
     return _PathWatch(path)
 
 
@@ -123,17 +124,17 @@ def watch_interface(name: str) -> DeviceWatch:
 
 
 def no_watch() -> DeviceWatch:
-    """Watch nothing: for buses that are no devices, where only time can tell."""
+    """Watch nothing: for buses without a device, where only the timeout ends a wait."""
     return DeviceWatch()
 
 
 class _PathWatch(DeviceWatch):
-    """Watches the directories in which a path, or what it leads over, would appear."""
+    """Watches the directories in which a path, or a part of it, would appear."""
 
     def __init__(self, path: str) -> None:
         super().__init__()
         self._path = os.path.abspath(path)
-        self._names: dict[int, set[bytes]] = {}  # what is looked for in the directory of a watch
+        self._names: dict[int, set[bytes]] = {}  # inotify watch -> names to look for in its directory
 
     def _open(self) -> int:
         self._names.clear()
@@ -144,7 +145,7 @@ class _PathWatch(DeviceWatch):
             return
         mask = _APPEARING | _IN_DELETE_SELF | _IN_MOVE_SELF | _IN_ONLYDIR
         for directory, name in _places(self._path):
-            with contextlib.suppress(OSError):  # it has just gone, or may not be read
+            with contextlib.suppress(OSError):  # it has just disappeared, or is not readable
                 watch = _checked(_libc.inotify_add_watch(self._descriptor, os.fsencode(directory), mask))
                 self._names.setdefault(watch, set()).add(os.fsencode(name))
 
@@ -169,7 +170,7 @@ def _checked(result: int) -> int:
 
 
 def _places(path: str) -> Iterator[tuple[str, str]]:
-    """Directories, and names in them, that have to appear for `path` to lead to a device."""
+    """Yield (directory, name): the names that must appear for `path` to lead to a device."""
     for _ in range(_LINKS_MAX):
         directory, name = os.path.split(path)
         while not os.path.isdir(directory):
@@ -182,7 +183,7 @@ def _places(path: str) -> Iterator[tuple[str, str]]:
 
 
 class _InterfaceWatch(DeviceWatch):
-    """Listens to the kernel's messages on network interfaces."""
+    """Listens to the kernel's messages about network interfaces."""
 
     def __init__(self, name: str) -> None:
         super().__init__()
@@ -205,7 +206,7 @@ class _InterfaceWatch(DeviceWatch):
         return False
 
     def _is_up(self, link: bytes) -> bool:
-        """Return True if a message says that the interface is up."""
+        """Return True if a message reports that the interface is up."""
         if len(link) < _LINK_MESSAGE.size or not _LINK_MESSAGE.unpack_from(link)[3] & _IFF_UP:
             return False
         at = _LINK_MESSAGE.size

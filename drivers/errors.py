@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 MESSAGE_MAX = 1000
-"""Characters of a message, which may quote whatever was found."""
+"""Longest error message in characters; a message may quote content of any length."""
 
 
 class DriverError(Exception):
@@ -11,10 +11,10 @@ class DriverError(Exception):
 
     Args:
         where: link, device or file (with line) that the error is about.
-        message: the fault and the remedy; what is beyond MESSAGE_MAX is cut off.
+        message: the fault and the remedy; the text is cut off after MESSAGE_MAX characters.
 
     Attributes:
-        where: as given.
+        where: link, device or file (with line) that the error is about.
     """
 
     def __init__(self, where: str, message: str) -> None:
@@ -24,16 +24,16 @@ class DriverError(Exception):
 
 
 class LinkError(DriverError):
-    """A port could not be opened, or went away while in use. Worth trying again."""
+    """A port could not be opened, or was lost while in use. A retry may succeed."""
 
 
 class DeviceError(DriverError):
-    """A device answered with an error, answered nonsense, or did not answer. The link itself works."""
+    """A device answered with an error, gave an invalid answer, or did not answer. The link itself works."""
 
 
 class TransmitForbiddenError(DriverError):
-    """Something asked to send on a link, or to a node, for which the configuration does not allow it."""
+    """A frame was to be sent on a link or to a node to which the configuration does not allow sending."""
 
 
 class DescriptionError(DriverError):
-    """An EDS, DBC, mapping table or captured file is malformed; the message names place and reason."""
+    """An EDS, DBC, mapping table or captured file is malformed; the message states where and why."""

@@ -1,4 +1,4 @@
-"""Detection of jumps: steps of a joint's position, between good samples, that no motion explains."""
+"""Detection of jumps: steps of a joint's position between good samples that are too large to be motion."""
 
 from __future__ import annotations
 
@@ -8,26 +8,28 @@ from drivers.clock import NS_PER_S, Stamp
 from drivers.readings import DeviceEvent, EventKind, Reading, Record, Status
 from drivers.stall_detector import LATE_S
 
-_MARGIN_NS = int(LATE_S * NS_PER_S)  # what samples may be read late by before they are marked
-_BACKLOG_NS = 5 * NS_PER_S  # what has queued is read within this time, however long nobody read
+_MARGIN_NS = int(LATE_S * NS_PER_S)  # samples may be read this late without being marked as doubtful
+_BACKLOG_NS = 5 * NS_PER_S  # a backlog is read within this time, however long reading was interrupted
 
 
 class JumpWatch:
-    """Compares each good sample of a joint with the good one before it, whatever bad ones lie in between.
+    """Compares each good sample of a joint with the previous good one, regardless of bad samples in between.
 
-    A sample that an alarm, an emergency or its own range voids is no position, but the one before it stays known: a
-    device that comes back elsewhere after an alarm or a restart has lost its place.
+    A sample that is invalid because of an alarm, an emergency or its own range is not a position, but the position
+    before it is kept: a device that comes back at a different position after an alarm or a restart has lost its
+    reference.
 
-    A stamp says when a sample was read. What arrives while nobody reads (a busy computer, a program that is stopped)
-    waits, and is stamped when it is read at last. So a sample that ends a silence, and those after it until the backlog
-    is surely read, may have been taken at any time since the silence began. They are told from others by their stamps
-    alone: a log is judged as what came live. Bad samples are no silence: somebody read them. Samples of doubtful time
-    are no good ones, and those of a backlog: it is read from the first of them on.
+    A stamp is the time at which a sample was read. Samples that arrive while nobody reads (because the computer is busy
+    or the program is stopped) wait, and are stamped when they are finally read. A sample that ends a silence, and the
+    samples after it until the backlog is certainly read, may therefore have been taken at any time since the silence
+    began. They are recognized by their stamps alone, so that a log is judged like live data. Bad samples do not count
+    as silence, because they show that the port was read. Samples of doubtful time are not good samples but mark a
+    backlog, which is read from the first of them on.
 
     Args:
-        max_rate_per_s: fastest motion of the joint, in the unit of the positions given to `jumped_from`.
-        slack: steps up to this are never a jump.
-        modulus: where positions wrap; None where they do not.
+        max_rate_per_s: fastest motion of the joint, in the unit of the positions passed to `jumped_from`.
+        slack: largest step that is never a jump.
+        modulus: value at which positions wrap; None if they do not.
     """
 
     def __init__(self, max_rate_per_s: float, slack: float, modulus: float | None = None) -> None:
@@ -35,16 +37,16 @@ class JumpWatch:
         self._slack = slack
         self._modulus = modulus
         self._good: float | None = None
-        self._good_from_ns = 0  # the earliest instant at which it may have been taken
+        self._good_from_ns = 0  # earliest instant at which `_good` may have been taken
         self._read_ns: int | None = None
         self._from_ns = self._late_until_ns = 0
 
     def bad(self, stamp: Stamp) -> None:
-        """Take a sample that carries no usable position."""
+        """Process a sample without a usable position."""
         self._read(stamp.monotonic_ns)
 
     def jumped_from(self, stamp: Stamp, position: float) -> float | None:
-        """Take a good sample; return the position before it if the joint cannot have moved so far since, else None."""
+        """Process a good sample; return the previous position if the joint cannot have moved that far, else None."""
         now_ns = stamp.monotonic_ns
         self._read(now_ns)
         if stamp.is_doubtful:
@@ -61,9 +63,9 @@ class JumpWatch:
         return before if abs(moved) > self._rate_per_ns * within_ns + self._slack else None
 
     def _read(self, now_ns: int) -> None:
-        """Note the earliest instant at which a sample that was read now may have been taken."""
+        """Update the earliest instant at which a sample read at `now_ns` may have been taken."""
         before_ns, self._read_ns = self._read_ns, now_ns
-        if before_ns is None:  # what waited at a port is discarded when it is opened
+        if before_ns is None:  # no backlog: opening a port discards waiting data
             self._from_ns = self._late_until_ns = now_ns
             return
         silence_ns = now_ns - before_ns
@@ -75,12 +77,12 @@ class JumpWatch:
 
 
 def joint_watch(max_rate_per_s: float | None, step: float, unit: str) -> JumpWatch | None:
-    """Make the watch of a joint whose values are compared as they are; None where no fastest motion is known.
+    """Return the watch for a joint whose values are compared directly; None if its fastest motion is unknown.
 
     Args:
-        max_rate_per_s: fastest motion, units per second.
-        step: the smallest change that its device can show.
-        unit: degrees wrap at a full turn.
+        max_rate_per_s: fastest motion in `unit` per second, or None.
+        step: resolution of its device, in `unit`.
+        unit: unit of the values; "deg" wraps at a full turn.
     """
     if max_rate_per_s is None:
         return None
@@ -88,7 +90,7 @@ def joint_watch(max_rate_per_s: float | None, step: float, unit: str) -> JumpWat
 
 
 def checked_reading(watch: JumpWatch, reading: Reading) -> list[Record]:
-    """Return the reading; one that no motion explains loses its value and follows the event that says so."""
+    """Return the reading; if it is a jump, return the event that reports the jump and the reading without a value."""
     if reading.value is None:
         watch.bad(reading.stamp)
         return [reading]
@@ -100,9 +102,9 @@ def checked_reading(watch: JumpWatch, reading: Reading) -> list[Record]:
 
 
 def jump_event(after: Reading, before: float) -> DeviceEvent:
-    """Return the event of a reading whose position jumped there from another value."""
+    """Return the event that reports a jump from the value `before` to the reading `after`."""
     text = (
-        f"position jumped from {before:.4f} to {after.value:.4f} {after.unit}, more than the joint can move: "
-        "a preset was written, or the encoder lost its place; check the joint's zero"
+        f"position jumped from {before:.4f} to {after.value:.4f} {after.unit}, farther than the joint can move: "
+        "a preset was written, or the encoder lost its position; check the joint's zero"
     )
     return DeviceEvent(after.channel, after.stamp, EventKind.PRESET_JUMP, text, after.raw_counts)

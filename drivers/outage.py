@@ -1,4 +1,4 @@
-"""Loss of a link: pauses between attempts to open it again, and the records of the outage."""
+"""Loss of a link: pauses between attempts to reopen it, and the records of the outage."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from drivers.clock import Stamp
 from drivers.readings import DeviceEvent, EventKind, Gap, GapReason, LinkItem
 
 BACKOFF_FIRST_S = 0.5
-BACKOFF_MAX_S = 1.5  # a device that is back is read within 2 s, even where nothing tells that it is
+BACKOFF_MAX_S = 1.5  # a device that is back is read within 2 s, even if nothing signals its return
 
 
 class Backoff:
-    """Pauses between attempts: doubling from BACKOFF_FIRST_S to BACKOFF_MAX_S, the same every time."""
+    """Pauses between attempts: doubling from BACKOFF_FIRST_S up to BACKOFF_MAX_S, without random variation."""
 
     def __init__(self) -> None:
         self._next_s = BACKOFF_FIRST_S
@@ -23,7 +23,7 @@ class Backoff:
         return wait_s
 
     def reset(self) -> None:
-        """Begin anew with the shortest pause."""
+        """Start again with the shortest pause."""
         self._next_s = BACKOFF_FIRST_S
 
 
@@ -32,7 +32,7 @@ class Outage:
 
     Args:
         link: name of the link.
-        emit: takes the events and gaps.
+        emit: called with each event and gap.
     """
 
     def __init__(self, link: str, emit: Callable[[LinkItem], None]) -> None:
@@ -45,19 +45,19 @@ class Outage:
         """Report that the link is down.
 
         Args:
-            reason: why, for an operator.
-            now: when that was noticed.
-            since: start of the gap, where the link was not down already.
+            reason: the reason, for an operator.
+            now: when the loss was noticed.
+            since: start of the gap; ignored if the link was already down.
         """
         if self._since is None:
             self._since = since
             self._emit(Gap(self._link, GapReason.LINK_DOWN, since))
-        if reason != self._reason:  # once a cause, not once an attempt
+        if reason != self._reason:  # once per cause, not once per attempt
             self._emit(DeviceEvent(self._link, now, EventKind.LINK_LOST, reason))
             self._reason = reason
 
     def end(self, now: Stamp, text: str) -> None:
-        """Report with `text` that the link is up."""
+        """Report with `text` that the link is up, and close the gap."""
         self._emit(DeviceEvent(self._link, now, EventKind.LINK_UP, text))
         if self._since is not None:
             self._emit(Gap(self._link, GapReason.LINK_DOWN, self._since, now))

@@ -1,7 +1,7 @@
-"""Captures (raw, as they crossed the wire) and the records decoded from them: all that drivers give.
+"""Captures (raw data as transferred on the wire) and the records decoded from them: the output of all drivers.
 
-A decoder is a pure state machine: it owns no port, no thread and no clock. It is fed captures in order and told the
-time, and returns records. Fed the same captures it returns the same records, so any reading can be made again.
+A decoder is a pure state machine: it owns no port, no thread and no clock. It receives captures in order and the time,
+and returns records. The same captures always give the same records, so any reading can be reproduced.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from drivers.clock import Stamp
 
 @dataclass(frozen=True, slots=True)
 class CanCapture:
-    """One CAN frame as it crossed the wire.
+    """One CAN frame as transferred on the wire.
 
     Attributes:
         link: name of the CAN link.
-        stamp: when the frame was received or sent; marked as doubtful where it may have been received long before.
+        stamp: when the frame was received or sent; marked as doubtful if it may have been received long before.
         arbitration_id: 11-bit, or 29-bit if `is_extended`; the error class bits of SocketCAN if `is_error`.
         data: 0 to 8 bytes.
         is_extended, is_remote, is_error: the frame's flags.
@@ -45,9 +45,9 @@ class SerialCapture:
     Attributes:
         link: name of the serial link.
         stamp: the instant just after the read returned (the last byte had arrived), or just before the write; marked
-            as doubtful where the bytes may have arrived long before.
-        data: at least one byte.
-        is_transmitted: rigcal sent them.
+            as doubtful if the bytes may have arrived long before.
+        data: the bytes, at least one.
+        is_transmitted: rigcal sent the bytes.
     """
 
     link: str
@@ -60,14 +60,14 @@ Capture = CanCapture | SerialCapture
 
 
 class Status(StrEnum):
-    """Why a value may or may not be used. Only OK readings carry a value that calibration may use."""
+    """Whether a value may be used, and if not, why. Only OK readings have a value that calibration may use."""
 
     OK = "ok"
     NOT_AVAILABLE = "not_available"  # the device itself sent "no value" (all ones, Exxx, distance 0)
-    OUT_OF_RANGE = "out_of_range"  # beyond the device's measuring range or the signal's declared range
-    DEVICE_ALARM = "device_alarm"  # the device reports an alarm (6503h, EMCY) that makes its value void
-    MALFORMED = "malformed"  # arrived, could not be decoded; a DecodeFailure says why
-    TIME_DOUBTFUL = "time_doubtful"  # nothing else is wrong, but it was read late: when it was measured is not known
+    OUT_OF_RANGE = "out_of_range"  # outside the device's measuring range or the signal's declared range
+    DEVICE_ALARM = "device_alarm"  # the device reports an alarm (6503h, EMCY) that makes its value invalid
+    MALFORMED = "malformed"  # received but could not be decoded; a DecodeFailure gives the reason
+    TIME_DOUBTFUL = "time_doubtful"  # valid, but read late, so the time of measurement is unknown
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,12 +75,12 @@ class Reading:
     """One value of one channel at one instant.
 
     Attributes:
-        channel: the joint value or signal (`theta1`, `L2`, `boom_valve`), as the rig file names it.
-        stamp: when the device sampled it, as well as the link can tell.
-        value: in `unit`; None unless `status` is OK.
-        unit: deg, mm, deg/s, mm/s, bar, mA, degC, ... as the rig file says.
+        channel: name of the joint value or signal in the rig file (`theta1`, `L2`, `boom_valve`).
+        stamp: when the device sampled the value, as accurately as the link can determine it.
+        value: value in `unit`; None unless `status` is OK.
+        unit: unit given in the rig file: deg, mm, deg/s, mm/s, bar, mA, degC, ...
         status: see Status.
-        raw_counts: the device's own integer, where there is one.
+        raw_counts: the device's own integer, if there is one.
     """
 
     channel: str
@@ -100,29 +100,29 @@ class LockState(StrEnum):
     WAITING = "waiting"
     ROTATING = "rotating"
     ERROR = "error"
-    UNKNOWN = "unknown"  # the record does not say (classic stations)
+    UNKNOWN = "unknown"  # not contained in the record (classic stations)
 
 
 @dataclass(frozen=True, slots=True)
 class Fix:
-    """One total-station measurement, as the instrument gave it.
+    """One total-station measurement as sent by the instrument.
 
-    Either circle readings with or without a distance, or (NEZ records) the instrument's own coordinates. Coordinates
-    in the station's frame are computed by `position_mm`, never taken from the instrument's horizontal distance.
+    A fix has either circle readings with or without a distance, or (NEZ records) the instrument's own coordinates.
+    Coordinates in the station's frame are computed by `position_mm`, never from the instrument's horizontal distance.
 
     Attributes:
         station: name of the station.
-        stamp: when the first byte of its record arrived; link delay is not taken off.
-        last_byte: when its last byte had arrived.
-        status: OK when a position can be computed and may be used.
+        stamp: when the first byte of its record arrived; the link delay is not subtracted.
+        last_byte: when the last byte of its record arrived.
+        status: OK if a position can be computed and may be used.
         lock: tracking state.
         hz_angle_rad: horizontal circle, clockwise from north, 0..2 pi.
         zenith_angle_rad: vertical circle, 0 = up, 0..2 pi (beyond pi: face 2).
-        slope_distance_m: as displayed by the instrument (its prism constant and ppm already applied).
+        slope_distance_m: distance as displayed by the instrument (with its prism constant and ppm already applied).
         north_m, east_m, up_m: the instrument's own coordinates (NEZ records only).
         face: 1 or 2.
-        prism_constant_mm, ppm, tilt_ok, edm_level: as the record says, None where it does not.
-        reason: for a status other than OK, in words.
+        prism_constant_mm, ppm, tilt_ok, edm_level: values from the record; None if it does not contain them.
+        reason: reason for a status other than OK.
         raw: the record's bytes without checksum and terminator.
     """
 
@@ -155,9 +155,9 @@ class EventKind(StrEnum):
     BUS_ERROR_WARNING = "bus_error_warning"
     BUS_ERROR_PASSIVE = "bus_error_passive"
     BUS_OFF = "bus_off"
-    BUS_ERROR = "bus_error"  # a protocol violation on the wire; error counters not yet beyond a limit
+    BUS_ERROR = "bus_error"  # a protocol violation on the wire; no error counter has reached a limit
     FRAMES_DROPPED = "frames_dropped"  # the kernel, the adapter or a full queue lost frames
-    TIME_DOUBTFUL = "time_doubtful"  # captures are stored, but when they were received is not known
+    TIME_DOUBTFUL = "time_doubtful"  # captures are stored, but their receive time is unknown
     BOOT_UP = "boot_up"
     NMT_STATE = "nmt_state"
     HEARTBEAT_LOST = "heartbeat_lost"
@@ -170,20 +170,20 @@ class EventKind(StrEnum):
     CONFIGURED = "configured"
     LOCK_ACQUIRED = "lock_acquired"
     LOCK_LOST = "lock_lost"
-    PRISM_JUMP = "prism_jump"  # the station's target jumped: it may follow another prism
-    PRISM_CONFIRMED = "prism_confirmed"  # an operator says that the station is on the prism that is meant
+    PRISM_JUMP = "prism_jump"  # the station's target jumped: it may follow a different prism
+    PRISM_CONFIRMED = "prism_confirmed"  # an operator confirmed that the station is on the intended prism
     STATION_SILENT = "station_silent"
     INSTRUMENT_ERROR = "instrument_error"
-    CLOCK_STEP = "clock_step"  # the computer's clock was set; the code is by how many milliseconds
+    CLOCK_STEP = "clock_step"  # the computer's clock was set; the code is the change in milliseconds
 
 
 @dataclass(frozen=True, slots=True)
 class DeviceEvent:
-    """Something that happened to a device or link, worth a row of its own.
+    """An event of a device or link.
 
     Attributes:
-        device: channel, station or link name.
-        stamp: when.
+        device: name of the channel, station or link.
+        stamp: when it happened.
         kind: see EventKind.
         text: one sentence for an operator.
         code: the device's own code (EMCY code, alarm bits, instrument error), if any.
@@ -198,10 +198,10 @@ class DeviceEvent:
 
 @dataclass(frozen=True, slots=True)
 class DecodeFailure:
-    """Captured bytes that could not be decoded: counted and kept, never guessed at.
+    """Captured bytes that could not be decoded. They are counted and stored, and their meaning is never guessed.
 
     Attributes:
-        device: channel, station or link name.
+        device: name of the channel, station or link.
         stamp: when the bytes arrived.
         reason: what was expected and what was found.
         raw: the bytes.
@@ -214,26 +214,26 @@ class DecodeFailure:
 
 
 class GapReason(StrEnum):
-    """Why a channel has nothing for a stretch of time."""
+    """Reasons why a channel has no data for a period of time."""
 
-    SILENT = "silent"  # the device is there no more, or was never
+    SILENT = "silent"  # the device has gone, or was never there
     LINK_DOWN = "link_down"
     FRAMES_LOST = "frames_lost"  # on the bus, in the kernel, in the adapter or in rigcal's queue
-    TIME_DOUBTFUL = "time_doubtful"  # captures are stored, but none of them may be used: their time is not known
+    TIME_DOUBTFUL = "time_doubtful"  # captures are stored but must not be used, because their time is unknown
     LOCK_LOST = "lock_lost"
-    NOT_RUNNING = "not_running"  # the daemon itself was not there
+    NOT_RUNNING = "not_running"  # the daemon itself was not running
 
 
 @dataclass(frozen=True, slots=True)
 class Gap:
-    """A stretch in which a channel gave nothing. Reported when it opens (`end` None) and again when it closes.
+    """A period without data from a channel. Reported when it opens (`end` None) and again when it closes.
 
     Attributes:
         channel: joint value, signal, station or link; `daemon` for rigcal itself.
         reason: see GapReason.
         start: the last instant at which the channel was known to be good.
-        end: the first instant at which it was good again; None while it lasts.
-        missed: how many readings are missing, where that can be told.
+        end: the first instant at which it was good again; None while the gap lasts.
+        missed: number of missing readings, if known.
     """
 
     channel: str
@@ -247,31 +247,31 @@ Record = Reading | Fix | DeviceEvent | DecodeFailure | Gap
 
 
 class Decoder(Protocol):
-    """A pure decoder of one link's captures. Never raises on any input; what it cannot decode is a DecodeFailure."""
+    """A pure decoder of one link's captures. It never raises; undecodable input becomes a DecodeFailure."""
 
     def feed(self, capture: Capture) -> Sequence[Record]:
-        """Records that this capture completes, in order."""
+        """Return the records that this capture completes, in order."""
 
     def tick(self, now: Stamp) -> Sequence[Record]:
-        """Records that the mere passing of time causes: missed heartbeats, silent channels."""
+        """Return the records that are caused by the passing of time alone: missed heartbeats, silent channels."""
 
 
 LinkItem = Capture | DeviceEvent | Gap
 
 
 class LinkLoop(Protocol):
-    """The thin loop that owns one port: opens it, reads it, opens it again when it goes away. It decodes nothing."""
+    """The thin loop that owns one port: opens it, reads it, and reopens it when it is lost. It decodes nothing."""
 
     @property
     def read_until(self) -> Stamp | None:
-        """All that the port had received by then has been handed on, and what was lost has been told.
+        """Instant up to which all data received by the port has been passed on and all losses have been reported.
 
-        None where nothing waits to be read, as while the port is not open, which has been told as well.
+        None if no data can be waiting, such as while the port is not open; that has been reported as well.
         """
 
     @property
     def name(self) -> str:
-        """Name of the link, as its captures carry it."""
+        """Name of the link in its captures."""
 
     def run(self, emit: Callable[[LinkItem], None], stop: threading.Event) -> None:
-        """Hand on every capture at once, and what captures cannot tell (link up, lost, dropped), until `stop`."""
+        """Until `stop`, pass every capture on at once, with events and gaps of the link (up, lost, dropped)."""

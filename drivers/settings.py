@@ -1,4 +1,4 @@
-"""Base of all sections of a configuration."""
+"""Base class of all sections of a configuration."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from pydantic import BaseModel, ConfigDict, ValidationInfo, field_validator
 
 
 class Settings(BaseModel):
-    """A section of a configuration: its keys are all known, and each value is of its key's kind."""
+    """A section of a configuration: unknown keys and values of the wrong type are refused."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     @field_validator("*", mode="before")
     @classmethod
     def _is_of_its_kind(cls, value: object, info: ValidationInfo) -> object:
-        """Refuse what pydantic would take for a number or a path: true for 1, an empty text for a directory."""
+        """Refuse values that pydantic would convert: true to the number 1, an empty string to a directory."""
         annotation = cls.model_fields[str(info.field_name)].annotation
         kinds = (annotation, *get_args(annotation))
         if isinstance(value, bool) and bool not in kinds:
             raise ValueError("cannot be true or false")
         if value == "" and Path in kinds:
-            raise ValueError("is empty; give a path, or leave the key out")
+            raise ValueError("is empty; give a path, or remove the key")
         return value

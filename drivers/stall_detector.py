@@ -1,29 +1,29 @@
-"""Detection of stalls of a link's loop: what was not read in time has no time of its own."""
+"""Detection of stalls of a link's loop: data that was not read in time has no reliable time."""
 
 from __future__ import annotations
 
 from drivers.clock import NS_PER_S, Clock, Stamp
 from drivers.readings import DeviceEvent, EventKind, Gap, GapReason
 
-LATE_S = 0.25  # what is read later than this is marked as of doubtful time, where nothing says when it came
-NOT_READ_IN_TIME = "nobody read for a while: rigcal was stopped, or the computer too busy"
+LATE_S = 0.25  # data without a receive time that is read later than this is marked as doubtful
+NOT_READ_IN_TIME = "the port was not read for a while, because rigcal was stopped or the computer was too busy"
 CLOCK_WAS_SET = "the computer's clock was set at that time"
 _REPORT_NS = NS_PER_S
 
 
 class StallDetector:
-    """Detects that a loop stood still: its program was stopped or starved, or held up by a device.
+    """Detects that a loop stalled: its program was stopped, got no CPU time, or was blocked by a device.
 
-    What has queued meanwhile, at a port whose kernel does not say when it came, is stamped with the instant of reading:
-    a fix would be joined with the joints of another pose. Its stamp must be marked as doubtful, and so must that of
-    what an adapter still holds, which follows at once.
+    Data that queued in the meantime, at a port whose kernel does not record when it arrived, is stamped with the time
+    of reading: a fix would be combined with the joints of a different pose. Its stamp must be marked as doubtful, and
+    so must the stamp of data that an adapter still holds, which follows at once.
 
-    So it is with what a port received while it was opened: adapters that start anew when they are opened are given two
-    seconds for it, and one that a killed program has left open sends on meanwhile.
+    The same applies to data that a port received while it was being opened: adapters that restart when they are opened
+    get two seconds for it, and an adapter that a killed program left open keeps sending in the meantime.
 
     Args:
-        clock: of the stamps; how long the loop stood still counts in real seconds, which is what computers take.
-        opened: just before the port was opened; now by default.
+        clock: clock of the stamps; the length of a stall is measured in real seconds.
+        opened: time just before the port was opened; the current time by default.
     """
 
     def __init__(self, clock: Clock, opened: Stamp | None = None) -> None:
@@ -32,11 +32,11 @@ class StallDetector:
         self._resumed: Stamp | None = None
 
     def is_late(self, now: Stamp, waited_s: float) -> bool:
-        """Return True if the data read just before `now` may have arrived long before. Call it at every read.
+        """Return True if the data read just before `now` may have arrived long before. Call this at every read.
 
         Args:
-            now: after the read.
-            waited_s: how long the read may have waited, real seconds.
+            now: time after the read.
+            waited_s: longest time that the read may have waited, in real seconds.
         """
         if self._real_s(now, self._last_read) > waited_s + LATE_S:
             self._resumed = now
@@ -44,7 +44,7 @@ class StallDetector:
         return self._resumed is not None and self._real_s(now, self._resumed) <= LATE_S
 
     def found_nothing(self, now: Stamp) -> None:
-        """Note that nothing waited in a port that has just been opened: what comes from `now` on is new."""
+        """Note that a port that was just opened held no data, so all data from `now` on is new."""
         self._last_read = now
 
     def _real_s(self, now: Stamp, since: Stamp) -> float:
@@ -56,35 +56,38 @@ class LateReport:
 
     Args:
         link: name of the link.
-        what: is counted, `frames` or `bytes`.
+        what: unit of the count, `frames` or `bytes`.
         start: when the link began to read.
     """
 
     def __init__(self, link: str, what: str, start: Stamp) -> None:
         self._link = link
         self._what = what
-        self._in_time = start  # the last instant before which nothing was doubtful
+        self._in_time = start  # the last instant at which nothing was doubtful
         self._count = 0
         self._reason = ""
 
     def add(self, count: int, reason: str) -> None:
-        """Add `count` captures, or bytes of them, that were marked as doubtful for `reason`."""
+        """Add `count` frames or bytes that were marked as doubtful because of `reason`."""
         self._count += count
         self._reason = reason
 
     def in_time(self, now: Stamp) -> list[DeviceEvent | Gap]:
-        """Note that what was read at `now` was read in time; return the report if one is due."""
+        """Note that the data read at `now` was read in time; return the report if one is due."""
         if self._count and now.since(self._in_time) < _REPORT_NS:
             return []
         return self.end(now)
 
     def end(self, now: Stamp) -> list[DeviceEvent | Gap]:
-        """Return the report of all that was added since the last one; empty if nothing was."""
+        """Return the report of everything added since the last report; empty if nothing was added."""
         start, self._in_time = self._in_time, now
         count, self._count = self._count, 0
         if not count:
             return []
-        text = f"{self._link}: {count} {self._what} are stored, but marked, as their time is doubtful: {self._reason}"
+        text = (
+            f"{self._link}: {count} {self._what} are stored but not used for calibration, as their time is doubtful: "
+            f"{self._reason}"
+        )
         return [
             DeviceEvent(self._link, now, EventKind.TIME_DOUBTFUL, text, count),
             Gap(self._link, GapReason.TIME_DOUBTFUL, start, now),

@@ -1,1 +1,1 @@
-"""A rig made of protocol-true devices with known, hidden imperfections, and replay of captured ones."""
+"""A simulated rig of devices with true protocols and known, hidden imperfections, and replay of captured traffic."""

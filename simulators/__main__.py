@@ -1,7 +1,7 @@
-"""`python -m simulators`: a simulated rig as a process of its own.
+"""`python -m simulators`: a simulated rig as a separate process.
 
-Its links are two pseudo-terminals that it makes (`--can-port`, `--station-port`), or a real CAN interface and a real
-serial device, at the other end of which any host listens: an installed service too.
+Its links are two pseudo-terminals that it creates (`--can-port`, `--station-port`), or a real CAN interface and a real
+serial device, to which any host can listen, including an installed service.
 
     python -m simulators --rig swdt82 --can socketcan:vcan0 --station-device /dev/ttyS1 --aim r --drive PLAN.csv --loop
 """
@@ -40,7 +40,7 @@ from simulators.wire_log import WireLog
 
 HIDDEN = "hidden_effect.json"
 INTERFACES: tuple[Interface, ...] = ("socketcan", "udp_multicast")
-MAP_HELP = "what a commissioned node's TPDO carries, as hexadecimal words of object 1A00h: 38:60040020+65050010"
+MAP_HELP = "TPDO mapping of a commissioned node, as hexadecimal words of object 1A00h: 38:60040020+65050010"
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -49,35 +49,35 @@ def _parser() -> argparse.ArgumentParser:
     )
     add = parser.add_argument
     add("--rig", required=True, help="a shipped rig's name or a path to a TOML file")
-    add("--seed", type=int, default=0, help="the machine and its noise")
-    add("--perturbation", type=float, default=1.0, help="deviation of the machine in build tolerances")
+    add("--seed", type=int, default=0, help="seed of the machine and its noise")
+    add("--perturbation", type=float, default=1.0, help="deviation of the machine, in build tolerances")
     add("--rate", type=float, default=1.0, help="simulated seconds per real second")
-    add("--origin", type=_origin, help="UTC_NS,MONOTONIC_NS,BOOT_ID at which simulated and real time agree")
+    add("--origin", type=_origin, help="UTC_NS,MONOTONIC_NS,BOOT_ID where simulated and real time agree")
     bus = parser.add_mutually_exclusive_group(required=True)
-    bus.add_argument("--can-port", type=Path, help="where a pseudo-terminal with an slcan adapter appears")
+    bus.add_argument("--can-port", type=Path, help="path of the pseudo-terminal with an slcan adapter")
     bus.add_argument("--can", type=_interface, metavar="INTERFACE:CHANNEL", help="a real bus: socketcan:vcan0")
-    add("--can-option", action="append", default=[], type=_option, metavar="NAME=VALUE", help="of python-can's bus")
+    add("--can-option", action="append", default=[], type=_option, metavar="NAME=VALUE", help="python-can option")
     line = parser.add_mutually_exclusive_group(required=True)
-    line.add_argument("--station-port", type=Path, help="where the station's pseudo-terminal appears")
+    line.add_argument("--station-port", type=Path, help="path of the station's pseudo-terminal")
     line.add_argument("--station-device", metavar="DEVICE", help="a real serial port, 8N1: /dev/ttyS1")
-    add("--aim", metavar="TARGET", help="turn the station to a prism or control point at the beginning")
-    add("--drive", type=Path, metavar="PLAN.csv", help="start at a plan's first pose, drive to the others, and end")
-    add("--loop", action="store_true", help="drive the plan again and again")
-    add("--dwell-s", type=float, default=5.0, help="how long to stand at each pose, unless the plan says longer")
-    add("--speed", type=float, default=0.25, help="of driving: share of the joints' greatest rates")
+    add("--aim", metavar="TARGET", help="turn the station to a prism or control point at the start")
+    add("--drive", type=Path, metavar="PLAN.csv", help="start at a plan's first pose, drive to the others and exit")
+    add("--loop", action="store_true", help="repeat the plan endlessly")
+    add("--dwell-s", type=float, default=5.0, help="minimum time at each pose; the plan may set a longer one")
+    add("--speed", type=float, default=0.25, help="driving speed as a share of the joints' maximum rates")
     add("--effects", default="", help="hidden effects: FAMILY@WHERE[:NAME=VALUE...],...")
-    add("--secret", type=Path, metavar="DIR", help=f"hide one more effect, drawn here, and name it in {HIDDEN} there")
+    add("--secret", type=Path, metavar="DIR", help=f"hide one more, randomly drawn effect; write it to {HIDDEN} in DIR")
     add("--faults", default="", help="scripted faults: KIND@SECONDS[:NAME=VALUE...],...")
-    add("--random-faults", type=float, metavar="SECONDS", help="further faults at this mean interval")
-    add("--bus-master", choices=("machine", "host"), default="machine", help="who starts the nodes and sends SYNC")
+    add("--random-faults", type=float, metavar="SECONDS", help="additional random faults at this mean interval")
+    add("--bus-master", choices=("machine", "host"), default="machine", help="sender of SYNC and NMT start")
     add("--map", action="append", default=[], type=_mapping, metavar="NODE:WORD+WORD...", help=MAP_HELP)
     add("--sync-ms", type=float, default=50.0, help="the machine's SYNC interval")
-    add("--signal-ms", type=float, default=10.0, help="cycle of the machine's own signals")
-    add("--setup", default="", help="name of the station set-up: decides where the machine stands")
+    add("--signal-ms", type=float, default=10.0, help="cycle time of the machine's own signals")
+    add("--setup", default="", help="name of the station set-up, which determines where the machine stands")
     add("--profile", choices=("topcon_gts8", "topcon_classic", "sokkia_set"), default="topcon_gts8")
-    add("--baud", type=int, default=9600, help="of the station's line")
-    add("--latency-ms", type=float, default=20.0, help="how old a measurement is when its record starts")
-    add("--push-s", type=float, help="the station sends records unasked at this interval")
+    add("--baud", type=int, default=9600, help="baud rate of the station's line")
+    add("--latency-ms", type=float, default=20.0, help="age of a measurement when its record starts")
+    add("--push-s", type=float, help="interval at which the station sends records without request")
     add("--wire-log", type=Path, metavar="FILE", help="append the rig's traffic and measurements to this file")
     return parser
 
@@ -85,7 +85,7 @@ def _parser() -> argparse.ArgumentParser:
 def _interface(text: str) -> tuple[Interface, str]:
     interface, _, channel = text.partition(":")
     if interface not in INTERFACES or not channel:
-        raise argparse.ArgumentTypeError(f"{text!r} is not INTERFACE:CHANNEL, with {' or '.join(INTERFACES)}")
+        raise argparse.ArgumentTypeError(f"{text!r} is not INTERFACE:CHANNEL; INTERFACE is {' or '.join(INTERFACES)}")
     return interface, channel
 
 
@@ -151,7 +151,7 @@ def _build(options: argparse.Namespace, start: Mapping[str, float] | None) -> tu
 
 
 def _stops(options: argparse.Namespace) -> list[Stop]:
-    """Return the stops of the plan that is to be driven; none without one."""
+    """Return the stops of the plan to drive; empty without a plan."""
     if options.dwell_s < 0 or not 0 < options.speed <= 1:
         raise ValueError("dwell-s must not be negative, speed must be above 0 and at most 1")
     if options.drive is None:
@@ -160,7 +160,7 @@ def _stops(options: argparse.Namespace) -> list[Stop]:
         return []
     stops = read_plan(options.drive, load_rig(options.rig), options.dwell_s)
     if options.loop and not any(stand_s for _, stand_s in stops) and len(stops) == 1:
-        raise ValueError("a plan of one pose without a dwell cannot be driven again and again")
+        raise ValueError("--loop cannot repeat a plan with a single pose and no dwell; set --dwell-s")
     return stops
 
 
@@ -176,7 +176,7 @@ def _ends(options: argparse.Namespace, stack: contextlib.ExitStack) -> tuple[Can
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a simulated rig until its plan or, without one, its standard input ends; returns the exit status."""
+    """Run a simulated rig until its plan or, without a plan, its standard input ends; return the exit status."""
     options = _parser().parse_args(arguments)
     origin = options.origin or SystemClock().now()
     wake_read, wake_write = os.pipe()
@@ -198,7 +198,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             live = LiveRig(simulator, clock, *_ends(options, stack), print_line, log, driver)
             if options.aim is not None:
                 simulator.aim(options.aim, 0.0)
-            if hidden is not None:  # its instants count from simulated second 0
+            if hidden is not None:  # times of the effect count from simulated second 0
                 told = json.dumps(hidden.as_dict() | {"begin_utc_ns": live.begin.utc_ns})
                 (options.secret / HIDDEN).write_text(told, encoding="utf-8")
         except (RigError, LinkError, ValueError, OSError) as error:
@@ -206,7 +206,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return 2
         try:
             live.run(sys.stdin.fileno(), wake_read)
-        except BrokenPipeError:  # the reader of the answers has ended
+        except BrokenPipeError:  # the process that reads the answers has exited
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     return 0
 

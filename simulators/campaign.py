@@ -20,18 +20,18 @@ from simulators.rig.truth import RigTruth
 
 Floats = NDArray[np.float64]
 
-_OF_POSES = ("time_s", "dwell_s")  # and directions and rates: they follow from the way from pose to pose
+_OF_POSES = ("time_s", "dwell_s")  # like directions and rates, these follow from the sequence of poses
 _CONDITIONS = ("payload_kg", "temperature_degC", "dwell_s")
 
 
 @dataclass(frozen=True)
 class Campaign:
-    """Observations of a machine that stood still in pose after pose.
+    """Observations of a machine at standstill in a sequence of poses.
 
     Attributes:
         truth: the machine.
-        observations: the table.
-        setup: where the station stood.
+        observations: table of the observations.
+        setup: name of the station set-up.
     """
 
     truth: RigTruth
@@ -39,7 +39,7 @@ class Campaign:
     setup: str
 
     def truth_as_dict(self) -> dict[str, Any]:
-        """Return what the analysis has to find: constants, prisms, base, weights and effects of the machine."""
+        """Return what the analysis should find: constants, prisms, base, weights and effects of the machine."""
         truth, base = self.truth, self.truth.placement(self.setup)
         return {
             "format": "rigcal simulated truth",
@@ -70,22 +70,22 @@ def simulate_campaign(
     noise_mm: float | None = None,
     recording: int = 0,
 ) -> Campaign:
-    """Build a machine within its tolerances, stand in poses, and measure all prisms in each.
+    """Build a machine within its tolerances, and measure all prisms at standstill in each of a number of poses.
 
-    Temperature, payload (where the rig has one) and the machine's signals run as in a working day. Fixes have the
-    random errors of the rig file's station or `noise_mm`, readings those of its encoders.
+    Temperature, payload (if the rig has one) and the machine's signals vary as in a working day. Fixes have the random
+    errors of the rig file's station or `noise_mm`, and readings the errors of the rig file's sensors.
 
     Args:
-        rig: the description that the machine deviates from.
-        poses: how many; of a plan, its first ones, again and again.
+        rig: the description, from which the machine deviates.
+        poses: number of poses; a plan with fewer rows is repeated.
         seed: the same seed builds the same machine.
-        plan: rows of a pose plan; poses random within the joint limits without one.
-        effects: hidden ones, `FAMILY@WHERE[:NAME=VALUE...]`, separated by commas.
-        noise_mm: standard deviation of each coordinate of a fix.
-        recording: another number takes other poses and other noise of the same machine.
+        plan: rows of a pose plan; without a plan, poses are random within the joint limits.
+        effects: hidden effects as `FAMILY@WHERE[:NAME=VALUE...]`, separated by commas.
+        noise_mm: standard deviation of each coordinate of a fix; None for the station of the rig file.
+        recording: a different number gives different poses and noise of the same machine.
 
     Raises:
-        ValueError: unknown effects, effects that the rig has no place for or that no machine has.
+        ValueError: an effect is unknown, has no place on the rig, or is larger than any machine can have.
     """
     hidden = parse_effects(effects)
     require_plausible(rig, hidden)
@@ -109,7 +109,7 @@ def simulate_campaign(
 
 
 def _conditions(truth: RigTruth, held: Mapping[str, Floats], rng: np.random.Generator) -> dict[str, Floats]:
-    """Columns by pose that effects may depend on, beside those that follow from the poses."""
+    """Return the columns on which effects may depend, except those that follow from the poses."""
     n = len(next(iter(held.values())))
     day = draw_duty_cycle(truth, max(n, 3), "wide", rng, moving=0.0, is_decoy=False).columns
     first = {name: float(values[0]) for name, values in day.items()}
@@ -121,7 +121,7 @@ def _conditions(truth: RigTruth, held: Mapping[str, Floats], rng: np.random.Gene
 
 
 def _planned(rig: Rig, rows: Sequence[PlanRow]) -> dict[str, Floats]:
-    """Columns that a plan asks for; -1 or 1 for the side from which a joint comes."""
+    """Return the columns that a plan prescribes; `_dir` is -1 or 1 for the direction from which a joint approaches."""
     sides = [f"{joint.name}_dir" for joint in rig.joints]
     return {
         name: np.array([row.conditions[name] for row in rows])

@@ -1,15 +1,15 @@
-"""Commands to a running rig, one JSON object a line, each answered by one.
+"""Commands to a running rig: one JSON object per line, each answered by one JSON object.
 
     {"do": "aim", "target": "r"}                                    -> {"event": "aimed", ...}
     {"do": "move", "pose": {"theta1": 10, ...}, "speed": 0.25}      -> {"event": "moving", "seconds": ...}, "arrived"
-    {"do": "fault", "kind": "lock_loss", "seconds": 4}              -> {"event": "accepted"}, and "fault" as it happens
+    {"do": "fault", "kind": "lock_loss", "seconds": 4}              -> {"event": "accepted"}, later "fault"
     {"do": "truth", "prism": "r", "pose": {...}, "columns": {...}}  -> {"event": "truth", "x_mm": ..., ...}
     {"do": "control_points"}                                        -> {"event": "control_points", "points": {...}}
     {"do": "poses", "n": 5, "seed": 1}                              -> {"event": "poses", "poses": [{...}, ...]}
     {"do": "tracked"}                                               -> {"event": "tracked", "target": "r" or null}
     {"do": "quit"}                                                  -> {"event": "bye"}
 
-What cannot be done is answered by {"event": "error", "text": ...}.
+A command that cannot be carried out is answered by {"event": "error", "text": ...}.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ _MOST_POSES = 10_000
 
 
 class Control:
-    """Obeys commands.
+    """Carries out commands.
 
     Attributes:
-        finished: `quit` was given.
+        finished: True after the command `quit`.
 
     Args:
         simulator: the rig.
@@ -52,11 +52,11 @@ class Control:
         }
 
     def obey(self, line: bytes, now_s: float) -> Message:
-        """Carry out the command of one line; returns the answer."""
+        """Carry out the command in one line; return the answer."""
         try:
             command = json.loads(line)
             if not isinstance(command, dict):
-                raise ValueError("a command is a JSON object")
+                raise ValueError("a command must be a JSON object")
             action = self._commands.get(str(command.get("do")))
             if action is None:
                 raise ValueError(f"unknown command {command.get('do')!r}; known: {', '.join(self._commands)}")
@@ -128,5 +128,5 @@ def _number(command: Message, name: str, default: float) -> float:
 def _numbers(command: Message, name: str) -> dict[str, float]:
     value = command.get(name, {})
     if not isinstance(value, dict):
-        raise ValueError(f"{command.get('do')}: {name} is not an object of names and numbers")
+        raise ValueError(f"{command.get('do')}: {name} must be an object of names and numbers")
     return {str(key): _number({"do": command.get("do"), key: number}, key, 0.0) for key, number in value.items()}

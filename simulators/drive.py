@@ -1,4 +1,4 @@
-"""Drives the boom through a plan: from stop to stop, once or again and again."""
+"""Driving the boom through a plan, from stop to stop, once or repeatedly."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ class PlanDriver:
 
     Args:
         simulator: the rig; it stands at the first stop.
-        stops: where to stand, and for how long.
-        speed: share of the joints' greatest rates.
-        repeat: begin anew after the last stop.
+        stops: poses, and how long to stand at each.
+        speed: share of the joints' maximum rates.
+        repeat: start again after the last stop.
     """
 
     def __init__(self, simulator: RigSimulator, stops: Sequence[Stop], *, speed: float, repeat: bool) -> None:
@@ -30,7 +30,7 @@ class PlanDriver:
             self._ends_s = arrival_s + stand_s
 
     def is_over(self, now_s: float) -> bool:
-        """Return True once the last stop has ended and the plan is not repeated; begins anew where it is."""
+        """Return True after the last stop of a plan that is not repeated; restart a plan that is repeated."""
         if now_s < self._ends_s:
             return False
         if self._repeat:
@@ -38,5 +38,5 @@ class PlanDriver:
         return not self._repeat
 
     def next_deadline(self) -> float:
-        """Instant at which the last stop ends, simulated seconds."""
+        """Return the instant at which the last stop ends, in simulated seconds."""
         return self._ends_s

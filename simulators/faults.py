@@ -1,4 +1,4 @@
-"""Faults of a simulated rig: a scripted or seeded schedule, and what each does to the devices.
+"""Faults of a simulated rig: a scripted or random schedule, and the effect of each fault on the devices.
 
 As text: `KIND@SECONDS[:NAME=VALUE...]`, separated by commas: `lock_loss@30:seconds=4,node_reboot@45:node=33`.
 """
@@ -24,11 +24,11 @@ Parameter = str | float
 
 # kind -> its parameters with their defaults; numbers are counts, seconds, or codes
 KINDS: Mapping[str, Mapping[str, Parameter]] = {
-    "lock_loss": {"seconds": 3.0},  # something stands in the line of sight
-    "prism_jump": {"to": ""},  # the station follows another prism and does not report it; "": any other
+    "lock_loss": {"seconds": 3.0},  # the line of sight is blocked
+    "prism_jump": {"to": ""},  # the station follows a different prism without reporting it; "": any other prism
     "bad_check": {"count": 1},  # records with a wrong block check
     "dropped_ack": {"count": 1},
-    "joined_buffers": {"count": 1},  # acknowledgement and record in one buffer, its first byte lost
+    "joined_buffers": {"count": 1},  # acknowledgement, without its first byte, and record in one buffer
     "clutter": {"count": 12},  # random bytes before the next record
     "station_silent": {"seconds": 5.0},
     "node_silent": {"node": 0, "seconds": 3.0},  # node 0: the first one
@@ -36,7 +36,7 @@ KINDS: Mapping[str, Mapping[str, Parameter]] = {
     "emergency": {"node": 0, "code": 0x5000, "register": 0x81},
     "emergency_clear": {"node": 0},
     "alarm": {"node": 0, "bits": 1, "seconds": 2.0},  # 0 s: until an alarm with bits 0
-    "warning": {"node": 0, "bits": 0x10},  # bits 0: the end of all warnings
+    "warning": {"node": 0, "bits": 0x10},  # bits 0: ends all warnings
     "preset_jump": {"node": 0, "counts": 1000},
     "counter_gap": {"count": 3},  # machine frames that never arrive
     "not_available": {"seconds": 1.0},  # machine signals all ones
@@ -63,9 +63,9 @@ class Fault:
     """A fault at an instant.
 
     Attributes:
-        at_s: when, simulated seconds.
+        at_s: time in simulated seconds.
         kind: one of KINDS.
-        parameters: all of the kind's.
+        parameters: values of all parameters of the kind.
     """
 
     at_s: float
@@ -73,33 +73,38 @@ class Fault:
     parameters: Mapping[str, Parameter]
 
     def number(self, name: str) -> float:
-        """Value of a numeric parameter."""
+        """Return the value of a numeric parameter."""
         return float(self.parameters[name])
 
     def count(self, name: str) -> int:
-        """Value of a whole-number parameter."""
+        """Return the value of an integer parameter."""
         return int(float(self.parameters[name]))
 
     def text(self, name: str) -> str:
-        """Value of a textual parameter."""
+        """Return the value of a text parameter."""
         return str(self.parameters[name])
 
 
 def make_fault(kind: str, at_s: float, given: Mapping[str, object]) -> Fault:
-    """Check a fault's parameters and complete them with the usual ones.
+    """Check a fault's parameters and add the defaults of the others.
+
+    Args:
+        kind: one of KINDS.
+        at_s: time in simulated seconds.
+        given: parameter name -> value.
 
     Raises:
-        ValueError: unknown kind or parameter, or a value of the wrong sort; the message names the known ones.
+        ValueError: the kind or a parameter is unknown (the message lists the known ones), or a value is invalid.
     """
     if kind not in KINDS:
         raise ValueError(f"unknown fault {kind!r}; known: {', '.join(KINDS)}")
     if not math.isfinite(at_s) or at_s < 0:
-        raise ValueError(f"fault {kind}: {at_s} is no instant; give seconds from the start")
+        raise ValueError(f"fault {kind}: {at_s} is not a valid time; give seconds from the start")
     known = KINDS[kind]
     parameters: dict[str, Parameter] = dict(known)
     for name, value in given.items():
         if name not in known:
-            raise ValueError(f"fault {kind} has no {name!r}; it has {', '.join(known)}")
+            raise ValueError(f"fault {kind} has no parameter {name!r}; known: {', '.join(known)}")
         parameters[name] = _checked(kind, name, value, known[name])
     return Fault(at_s, kind, parameters)
 
@@ -116,12 +121,12 @@ def _checked(kind: str, name: str, value: object, default: Parameter) -> Paramet
         raise ValueError(f"fault {kind}: {name} = {value!r} is not a number") from None
     whole = isinstance(default, int)
     if not math.isfinite(number) or (whole and number != int(number)) or (number < 0 and name != "counts"):
-        raise ValueError(f"fault {kind}: {name} = {value!r} is not a {'whole ' if whole else ''}number from 0 up")
+        raise ValueError(f"fault {kind}: {name} = {value!r} is not a {'whole ' if whole else ''}number of 0 or more")
     return int(number) if whole else number
 
 
 def parse_faults(text: str) -> tuple[Fault, ...]:
-    """Parse a schedule (see the module's head); ValueError says where it is wrong."""
+    """Parse a schedule (see the module docstring); ValueError if it is invalid, with the wrong part."""
     faults = []
     for part in (p.strip() for p in text.split(",")):
         if not part:
@@ -131,7 +136,7 @@ def parse_faults(text: str) -> tuple[Fault, ...]:
         try:
             at_s = float(seconds)
         except ValueError:
-            raise ValueError(f"{part!r}: say when, as in {kind or 'lock_loss'}@30") from None
+            raise ValueError(f"{part!r}: give the time in seconds, as in {kind or 'lock_loss'}@30") from None
         pairs = [setting.partition("=") for setting in settings]
         if not at or any(not sign for _, sign, _ in pairs):
             raise ValueError(f"{part!r}: expected KIND@SECONDS[:NAME=VALUE...]")
@@ -142,7 +147,7 @@ def parse_faults(text: str) -> tuple[Fault, ...]:
 def random_faults(
     seed: int, duration_s: float, mean_interval_s: float, kinds: Iterable[str] = tuple(KINDS)
 ) -> tuple[Fault, ...]:
-    """Draw faults at random instants (exponential intervals), of the given kinds with their usual parameters."""
+    """Draw faults of the given kinds with default parameters at random times with exponential intervals."""
     rng = np.random.default_rng([seed, 20])
     names = tuple(kinds)
     faults, at_s = [], float(rng.exponential(mean_interval_s))
@@ -153,7 +158,7 @@ def random_faults(
 
 
 class FaultSchedule:
-    """Faults in the order of time; those of one instant in the order in which they were added."""
+    """Faults ordered by time; faults at the same time are in the order in which they were added."""
 
     def __init__(self, faults: Iterable[Fault] = ()) -> None:
         self._waiting: list[tuple[float, int, Fault]] = []
@@ -174,12 +179,12 @@ class FaultSchedule:
         return out
 
     def next_deadline(self) -> float:
-        """Instant at which the next fault is due."""
+        """Return the instant at which the next fault is due."""
         return self._waiting[0][0] if self._waiting else math.inf
 
 
 class FaultyRig(Protocol):
-    """The parts of a rig that faults concern."""
+    """The parts of a rig that faults affect."""
 
     machine: Machine
     nodes: tuple[CanopenNode, ...]
@@ -187,7 +192,7 @@ class FaultyRig(Protocol):
     station: TotalStation
 
     def put(self, frame: Frame) -> None:
-        """Let a frame appear on the bus."""
+        """Put a frame on the bus."""
 
     def inject(self, fault: Fault) -> None:
         """Add a fault to the schedule."""
@@ -203,11 +208,11 @@ def check_fault(rig: FaultyRig, fault: Fault) -> None:
     if "node" in fault.parameters:
         node = _node(rig, fault)
         if fault.kind in ("alarm", "warning", "preset_jump") and not isinstance(node, PositionNode):
-            raise ValueError(f"fault {fault.kind}: node {node.node} is no encoder or length transducer")
+            raise ValueError(f"fault {fault.kind}: node {node.node} is not an encoder or length transducer")
 
 
 def apply_fault(rig: FaultyRig, fault: Fault, now_s: float) -> None:
-    """Apply a fault that `check_fault` has passed."""
+    """Apply a fault that `check_fault` has accepted."""
     station, tracker = rig.station, rig.station.tracker
     match fault.kind:
         case "lock_loss":
@@ -232,7 +237,7 @@ def apply_fault(rig: FaultyRig, fault: Fault, now_s: float) -> None:
             identifier, data = _BUS_ERRORS[fault.text("state")]
             rig.put(Frame(identifier, data, is_error=True))
         case "unplug":
-            pass  # the port's owner does it when it is told of the fault
+            pass  # the owner of the port does this on the fault's event
         case _:
             _node_fault(rig, fault, now_s)
 
@@ -265,7 +270,7 @@ def _node(rig: FaultyRig, fault: Fault) -> CanopenNode:
         if number in (0, node.node):
             return node
     have = ", ".join(str(node.node) for node in rig.nodes) or "none"
-    raise ValueError(f"fault {fault.kind}: this rig has no node {number}; it has {have}")
+    raise ValueError(f"fault {fault.kind}: this rig has no node {number}; nodes: {have}")
 
 
 def _another_prism(rig: FaultyRig, now_s: float) -> str:

@@ -1,6 +1,7 @@
-"""The rig's ends of its two links: pseudo-terminals that it makes itself, or real interfaces and devices.
+"""The rig's ends of its two links: pseudo-terminals that it creates itself, or real interfaces and devices.
 
-An end is plugged in or not; what is sent meanwhile is lost. A LinkError says that a real interface or device is gone.
+An end is plugged in or unplugged; data sent while it is unplugged is lost. A LinkError reports that a real interface or
+device was lost.
 """
 
 from __future__ import annotations
@@ -25,20 +26,20 @@ class LinkEnd(Protocol):
 
     @property
     def name(self) -> str:
-        """Path or channel, for people."""
+        """Path or channel, for messages."""
 
     @property
     def plugged(self) -> bool:
-        """True if it is there."""
+        """True if the end is plugged in."""
 
     def fileno(self) -> int:
         """Return the descriptor for `select`, while it is plugged in."""
 
     def plug(self) -> None:
-        """Make it appear; LinkError or OSError where that is not possible at present."""
+        """Plug the end in; LinkError or OSError if that is not possible at present."""
 
     def unplug(self) -> None:
-        """Make it vanish; does nothing when it is gone."""
+        """Unplug the end; does nothing if it is unplugged."""
 
 
 class CanEnd(LinkEnd, Protocol):
@@ -58,14 +59,14 @@ class StationEnd(LinkEnd, Protocol):
         """Return the bytes that the host wrote since the last call."""
 
     def write(self, data: bytes) -> None:
-        """Send; never blocks."""
+        """Send bytes; never blocks."""
 
 
 class SlcanEnd:
     """An slcan adapter on a pseudo-terminal.
 
     Args:
-        path: where the port appears.
+        path: path of the port's symbolic link.
     """
 
     def __init__(self, path: Path) -> None:
@@ -97,7 +98,7 @@ class SlcanEnd:
         was = self._adapter.channel
         answers, frames = self._adapter.feed(data)
         if was is Channel.CLOSED and self._adapter.channel is not Channel.CLOSED:
-            self._port.discard()  # what an earlier host left unread
+            self._port.discard()  # data that an earlier host left unread
         self._port.write(answers)
         return frames
 
@@ -106,7 +107,7 @@ class SlcanEnd:
 
 
 class _DeviceEnd(Generic[Port]):
-    """An end at a real interface or device, whose port is open while it is plugged in."""
+    """An end at a real interface or device; its port is open while the end is plugged in."""
 
     _port: Port | None = None
 
@@ -126,14 +127,14 @@ class _DeviceEnd(Generic[Port]):
 class BusEnd(_DeviceEnd[CanPort]):
     """A real interface of python-can.
 
-    Error frames are a controller's own: none are sent here.
+    Error frames come from a controller and are never sent here.
 
     Args:
-        interface, channel: as python-can has them.
-        options: further arguments of its bus.
+        interface, channel: interface and channel in python-can's notation.
+        options: further arguments of python-can's bus.
 
     Raises:
-        LinkError: it cannot be opened.
+        LinkError: the interface cannot be opened.
     """
 
     def __init__(self, interface: Interface, channel: str, options: Mapping[str, Any]) -> None:
@@ -165,7 +166,7 @@ class SerialEnd(_DeviceEnd[SerialPort]):
         baud: bits per second; 8 data bits, no parity, 1 stop bit.
 
     Raises:
-        LinkError: it cannot be opened.
+        LinkError: the device cannot be opened.
     """
 
     def __init__(self, path: str, baud: int) -> None:

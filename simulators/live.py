@@ -16,25 +16,25 @@ from simulators.link_ends import CanEnd, LinkEnd, StationEnd
 from simulators.rig_simulator import Output, RigSimulator
 from simulators.wire_log import WireLog
 
-_SHORTEST_SLEEP_S = 0.001  # real: finer would only cost
+_SHORTEST_SLEEP_S = 0.001  # real seconds; shorter sleeps would only cost CPU time
 _LONGEST_SLEEP_S = 0.5
 _LONGEST_LINE = 65536
-_REOPEN_S = 1.0  # after an interface or a device has gone
+_REOPEN_S = 1.0  # pause before reopening a lost interface or device
 
 
 class LiveRig:
     """A simulated rig's two links, and its commands as JSON lines.
 
     Attributes:
-        begin: the clock at simulated second 0.
+        begin: time of the clock at simulated second 0.
 
     Args:
         simulator: the rig.
-        clock: shared with the host.
-        can, station: its ends of the links.
-        send: takes each answer and event.
-        log: takes the traffic on the links; None: no log.
-        driver: drives the boom, if anything but commands does; the rig ends with its plan.
+        clock: clock shared with the host.
+        can, station: the rig's ends of the links.
+        send: called with each answer and event.
+        log: log of the traffic on the links; None for no log.
+        driver: drives the boom through a plan, whose end stops the rig; None if only commands move the boom.
     """
 
     def __init__(
@@ -50,7 +50,7 @@ class LiveRig:
         self._simulator, self._clock, self._send = simulator, clock, send
         self._can, self._station, self._driver = can, station, driver
         self.begin = clock.now()
-        self._replug: dict[str, float] = {}  # link -> when it comes back, simulated seconds
+        self._replug: dict[str, float] = {}  # link -> when to plug it in again, simulated seconds
         self._control = Control(simulator)
         self._lines = bytearray()
         self._log = log
@@ -70,11 +70,11 @@ class LiveRig:
         self._log.measured(self._monotonic_ns(at_s), target, place, machine.motion.values(at_s))
 
     def run(self, commands: int, wake: int) -> None:
-        """Run until `quit`, the end of the driver's plan, or a byte at `wake`; without a driver, to the commands' end.
+        """Run until `quit`, the end of the driver's plan or a byte at `wake`; without a driver until the commands end.
 
         Args:
             commands: file descriptor of the JSON lines.
-            wake: file descriptor that a signal handler writes to.
+            wake: file descriptor to which a signal handler writes.
         """
         if self._driver is not None:
             self._driver.start(self._now_s())
@@ -107,7 +107,7 @@ class LiveRig:
         return max(_SHORTEST_SLEEP_S, min(_LONGEST_SLEEP_S, self._clock.real_seconds(wait_s)))
 
     def _read_commands(self, commands: int, now_s: float) -> bool:
-        """False at the end of the commands."""
+        """Read and carry out commands; return False at their end."""
         data = os.read(commands, 65536)
         self._lines += data
         *lines, rest = self._lines.split(b"\n")
@@ -149,7 +149,7 @@ class LiveRig:
             self._tell(event, now_s)
 
     def _lose(self, link: str, text: str, now_s: float) -> None:
-        """A real interface or device is gone; it is opened again when it is back."""
+        """Handle the loss of a real interface or device; it is opened again when it is back."""
         self._ends()[link].unplug()
         self._replug[link] = now_s + _REOPEN_S
         self._tell({"event": "unplugged", "link": link, "text": text}, now_s)
@@ -173,6 +173,6 @@ class LiveRig:
 
 
 def print_line(message: Mapping[str, object]) -> None:
-    """Write a JSON line to standard output."""
+    """Write a message as a JSON line to standard output."""
     sys.stdout.write(json.dumps(message) + "\n")
     sys.stdout.flush()

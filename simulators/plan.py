@@ -1,4 +1,4 @@
-"""Pose plans, as `rigcal plan` writes them, and the stops of a boom that follows one."""
+"""Reading pose plans written by `rigcal plan`, and the stops of a boom that follows a plan."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from typing import Any
 
 from calibration.rig.description import Rig
 
-APPROACH = {"deg": 3.0, "mm": 50.0}  # from how far a joint comes to a pose that says from which side
+APPROACH = {"deg": 3.0, "mm": 50.0}  # length of the approach to a pose with a prescribed direction
 MOST_ROWS = 100_000
 _CONDITIONS = frozenset({"dwell_s", "payload_kg", "temperature_degC"})
 
-Stop = tuple[Mapping[str, float], float]  # joint -> deg or mm; how long to stand there, s
+Stop = tuple[Mapping[str, float], float]  # (joint -> deg or mm, standing time in s)
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class PlanRow:
 
     Attributes:
         joints: joint name -> deg or mm.
-        conditions: other columns of numbers -> value: `<joint>_dir`, `dwell_s`, `payload_kg`, ...
+        conditions: name of another numeric column -> value: `<joint>_dir`, `dwell_s`, `payload_kg`, ...
     """
 
     joints: Mapping[str, float]
@@ -38,12 +38,12 @@ def read_plan(path: Path, rig: Rig, dwell_s: float) -> list[Stop]:
 
     Args:
         path: the file.
-        rig: whose poses they are.
-        dwell_s: how long to stand at each, unless a row says longer.
+        rig: the rig of the plan.
+        dwell_s: minimum standing time at each pose; a row may set a longer one.
 
     Raises:
-        ValueError: the file is no plan of this rig; the message names the line.
-        OSError: it cannot be read.
+        ValueError: the file is not a plan for this rig; the message names the line.
+        OSError: the file cannot be read.
     """
     return [stop for row in plan_rows(path, rig) for stop in _stops(rig, row, dwell_s)]
 
@@ -53,23 +53,23 @@ def plan_rows(path: Path, rig: Rig) -> list[PlanRow]:
 
     Args:
         path: the file.
-        rig: whose poses they are.
+        rig: the rig of the plan.
 
     Raises:
-        ValueError: the file is no plan of this rig; the message names the line.
-        OSError: it cannot be read.
+        ValueError: the file is not a plan for this rig; the message names the line.
+        OSError: the file cannot be read.
     """
     rows: list[PlanRow] = []
     with path.open(encoding="utf-8-sig", newline="") as file:
         try:
             for line, row in enumerate(csv.DictReader(file, strict=True), start=2):
                 if line > MOST_ROWS:
-                    raise ValueError(f"more than {MOST_ROWS} lines; split it")
+                    raise ValueError(f"more than {MOST_ROWS} lines; split the file")
                 try:
                     rows.append(_row(rig, {key: cell for key, cell in row.items() if cell}))
                 except ValueError as error:
                     raise ValueError(f"line {line}: {error}") from None
-        except (ValueError, csv.Error) as error:  # a file that is no UTF-8 is a ValueError as well
+        except (ValueError, csv.Error) as error:  # a file that is not UTF-8 also raises ValueError
             raise ValueError(f"{path}: {error}") from None
     if not rows:
         raise ValueError(f"{path}: no poses; `rigcal plan --out CSV` writes a plan")
@@ -79,22 +79,22 @@ def plan_rows(path: Path, rig: Rig) -> list[PlanRow]:
 def stops_of(rig: Rig, rows: Iterable[Mapping[str, Any]], dwell_s: float) -> list[Stop]:
     """Return the stops for the rows of a pose plan.
 
-    Where a row says from which side a joint comes, the boom first goes to that side of the pose, without a stop. Other
-    conditions than that and the dwell are nothing that driving could bring about.
+    If a row prescribes the direction of a joint, the boom first goes past the pose to the right side without stopping.
+    Other conditions except the dwell are ignored, as driving cannot influence them.
 
     Args:
-        rig: whose poses they are.
-        rows: as `rigcal plan` has them.
-        dwell_s: how long to stand at each, unless a row says longer.
+        rig: the rig of the plan.
+        rows: rows of a plan by `rigcal plan`.
+        dwell_s: minimum standing time at each pose; a row may set a longer one.
 
     Raises:
-        ValueError: a row without a number for each joint, or with one beyond its limits.
+        ValueError: a row lacks a number for a joint, or a number is beyond the joint's limits.
     """
     return [stop for row in rows for stop in _stops(rig, _row(rig, row), dwell_s)]
 
 
 def _row(rig: Rig, row: Mapping[str, Any]) -> PlanRow:
-    asked = f"a pose has a number for each of {', '.join(j.column for j in rig.joints)}"
+    asked = f"a pose needs a number for each of {', '.join(j.column for j in rig.joints)}"
     joints = {joint.name: _finite(row.get(joint.column), asked) for joint in rig.joints}
     known = {*row} & {*(f"{joint.name}_dir" for joint in rig.joints), *_CONDITIONS}
     conditions = {
@@ -108,7 +108,7 @@ def _row(rig: Rig, row: Mapping[str, Any]) -> PlanRow:
 
 
 def _finite(value: Any, asked: str) -> float:
-    """Return a finite number; ValueError says what was asked for."""
+    """Return a finite number; ValueError with text `asked` if the value is not one."""
     with contextlib.suppress(TypeError, ValueError, OverflowError):
         number = float(value)
         if math.isfinite(number):
@@ -117,7 +117,7 @@ def _finite(value: Any, asked: str) -> float:
 
 
 def _stops(rig: Rig, row: PlanRow, dwell_s: float) -> list[Stop]:
-    """Return the way to a pose: past it first, where it says from which side to come."""
+    """Return the stops for a pose, with an approach before it if the row prescribes a direction."""
     sides = {joint.name: row.conditions.get(f"{joint.name}_dir", 0.0) for joint in rig.joints}
     before = {
         joint.name: min(

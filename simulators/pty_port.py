@@ -1,4 +1,4 @@
-"""A pseudo-terminal behind a symbolic link: the serial port that a simulated device is plugged into."""
+"""A pseudo-terminal behind a symbolic link: the serial port of a simulated device."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ import termios
 import tty
 from pathlib import Path
 
-_BACKLOG = 65536  # bytes kept for a host that does not read; further ones are lost, as on a real line
+_BACKLOG = 65536  # bytes kept for a host that does not read; more are lost, as on a real line
 
 
 class Backlog:
-    """Bytes that wait for a host that does not read.
+    """Buffer for bytes that the host has not read yet.
 
     Attributes:
-        lost: number of bytes for which there was no room.
+        lost: number of bytes lost because the buffer was full.
     """
 
     def __init__(self) -> None:
@@ -23,7 +23,7 @@ class Backlog:
         self._waiting = bytearray()
 
     def write(self, descriptor: int, data: bytes) -> None:
-        """Write to a descriptor that does not block what it takes, and keep the rest for the next call."""
+        """Write as much as possible to a non-blocking descriptor, and keep the rest for the next call."""
         if not (data or self._waiting):
             return
         room = _BACKLOG - len(self._waiting)
@@ -36,7 +36,7 @@ class Backlog:
         del self._waiting[:sent]
 
     def clear(self) -> None:
-        """Forget what waits."""
+        """Discard all buffered bytes."""
         self._waiting.clear()
 
 
@@ -47,10 +47,10 @@ class PtyPort:
         path: the symbolic link.
 
     Args:
-        path: where the link appears; its directory must exist. A link that is there already is replaced.
+        path: path of the symbolic link; its directory must exist. An existing link is replaced.
 
     Raises:
-        OSError: no pty is to be had, or the link cannot be made.
+        OSError: no pty is available, or the link cannot be created.
     """
 
     def __init__(self, path: Path) -> None:
@@ -62,12 +62,12 @@ class PtyPort:
 
     @property
     def name(self) -> str:
-        """The symbolic link, for people."""
+        """Path of the symbolic link, for messages."""
         return str(self.path)
 
     @property
     def lost(self) -> int:
-        """Number of bytes that no host read."""
+        """Number of bytes lost because no host read them."""
         return self._backlog.lost
 
     @property
@@ -76,15 +76,15 @@ class PtyPort:
         return self._master >= 0
 
     def fileno(self) -> int:
-        """The master's file descriptor, for `select`."""
+        """Return the master's file descriptor, for `select`."""
         return self._master
 
     def plug(self) -> None:
-        """Make the port appear; does nothing if it is there."""
+        """Create the port; does nothing if it exists."""
         if self.plugged:
             return
         self._master, self._slave = pty.openpty()
-        # The slave end stays open here, so that the port outlives hosts that come and go.
+        # The slave end stays open here, so that the port continues to exist when a host closes it
         tty.setraw(self._slave)
         os.set_blocking(self._master, False)
         fresh = self.path.with_name(f".{self.path.name}.{os.getpid()}")
@@ -97,7 +97,7 @@ class PtyPort:
             raise
 
     def unplug(self) -> None:
-        """Make the port vanish: link and device; a host that has it open gets errors."""
+        """Remove the port's link and device; a host that has it open gets errors."""
         if not self.plugged:
             return
         if self.path.is_symlink() and os.readlink(self.path) == os.ttyname(self._slave):
@@ -120,7 +120,7 @@ class PtyPort:
             return b""
 
     def write(self, data: bytes) -> None:
-        """Send; never blocks."""
+        """Send bytes; never blocks."""
         if self.plugged:
             self._backlog.write(self._master, data)
 

@@ -1,4 +1,4 @@
-"""Captured links in place of real ones: captures come again at their recorded times."""
+"""Replay of captured links instead of real ones: captures are emitted at their recorded times."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from drivers.readings import Capture, LinkItem
 
 
 class ReplayLink:
-    """A link loop that hands on recorded captures when the clock reaches their stamps.
+    """A link loop that emits recorded captures when the clock reaches their stamps.
 
     Args:
-        name: of the link.
-        captures: in the order of their stamps, on the monotonic clock of `clock`.
-        clock: when it is; its rate is the speed of the replay.
+        name: name of the link.
+        captures: captures ordered by their stamps, on the monotonic clock of `clock`.
+        clock: the clock; its rate is the speed of the replay.
     """
 
     def __init__(self, name: str, captures: Iterable[Capture], clock: Clock) -> None:
@@ -26,11 +26,11 @@ class ReplayLink:
 
     @property
     def read_until(self) -> Stamp:
-        """Now: nothing is received that would wait to be read."""
+        """The current time: no received data is ever waiting to be read."""
         return self._clock.now()
 
     def run(self, emit: Callable[[LinkItem], None], stop: threading.Event) -> None:
-        """Hand on everything, then stay silent until `stop`."""
+        """Emit all captures, then stay silent until `stop`."""
         for capture in self._captures:
             ahead_ns = capture.stamp.monotonic_ns - self._clock.monotonic_ns()
             if ahead_ns > 0 and self._clock.wait(stop, ahead_ns / NS_PER_S):

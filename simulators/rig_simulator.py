@@ -1,7 +1,7 @@
 """A whole rig: machine, encoder nodes, machine controller, bus master and total station on one time line.
 
-Sans-IO: frames, bytes and the time go in, frames, bytes and events come out. `live.py` puts it on ptys in real or
-scaled time. Times are simulated seconds.
+It does no I/O: it takes frames, bytes and the time, and returns frames, bytes and events. `live.py` connects it to
+links in real or scaled time. Times are simulated seconds.
 """
 
 from __future__ import annotations
@@ -38,14 +38,14 @@ class SimulatorSettings:
     """Settings of a simulated rig.
 
     Attributes:
-        bus_master: `machine`: the machine's controller has commissioned the nodes, starts them and sends SYNC; a host
-            may just listen. `host`: the nodes are fresh from the factory, silent until a host sets them up.
-        sync_period_s: the machine's SYNC.
-        signal_period_s: cycle of the machine controller's signals; machine.dbc says 10 ms.
-        station: the instrument.
-        setup: station set-up, decides where the machine stands.
-        mappings: node -> content of its TPDO if the machine has commissioned it otherwise than the factory, as
-            words of object 1A00h.
+        bus_master: `machine`: the machine's controller has commissioned the nodes, starts them and sends SYNC, so a
+            host can just listen. `host`: the nodes have factory settings and are silent until a host sets them up.
+        sync_period_s: SYNC interval of the machine.
+        signal_period_s: cycle time of the machine controller's signals; machine.dbc states 10 ms.
+        station: settings of the instrument.
+        setup: name of the station set-up, which determines where the machine stands.
+        mappings: node -> words of object 1A00h, if the machine has commissioned the node's TPDO with a mapping
+            different from the factory's.
     """
 
     bus_master: Literal["machine", "host"] = "machine"
@@ -61,9 +61,9 @@ class Output:
     """Output of the rig, in order.
 
     Attributes:
-        frames: on the bus, but for the host's own.
+        frames: frames on the bus, except the host's own.
         station: bytes from the total station.
-        events: `arrived`, `fault`: for the process that drives the rig.
+        events: `arrived` and `fault` events, for the process that drives the rig.
     """
 
     frames: list[Frame] = field(default_factory=list)
@@ -79,14 +79,14 @@ class RigSimulator:
 
     Args:
         truth: the true machine.
-        seed: noise.
+        seed: seed of the noise.
         settings: see SimulatorSettings.
-        faults: what goes wrong.
-        start: joint values at the beginning; the middle of the limits where missing.
+        faults: scheduled faults.
+        start: joint name -> initial value; missing joints start in the middle of their limits.
 
     Raises:
-        ValueError: a start pose beyond the limits, DBC signals of another machine than the simulated one, or a fault
-            of a part that the rig does not have.
+        ValueError: the start pose is beyond the limits, DBC signals belong to a different machine than the simulated
+            one, or a fault concerns a part that the rig does not have.
     """
 
     def __init__(
@@ -126,11 +126,14 @@ class RigSimulator:
     # Commands
 
     def aim(self, target: str, now_s: float) -> None:
-        """Point the station at a prism or control point; ValueError if there is none."""
+        """Point the station at a prism or control point; ValueError if it is unknown."""
         self.station.aim_at(target, now_s)
 
     def move(self, pose: Mapping[str, float], now_s: float, *, speed: float = 0.25, dwell_s: float = 0.0) -> float:
-        """Append a move to the plan, see `BoomMotion.move`; an `arrived` event follows. Returns when it will."""
+        """Append a move to the plan and return its arrival time; an `arrived` event follows.
+
+        See `BoomMotion.move` for the arguments.
+        """
         arrival_s = self.machine.motion.move(now_s, pose, speed=speed, dwell_s=dwell_s)
         self._arrivals.append((arrival_s, dict(pose)))
         return arrival_s
@@ -141,7 +144,7 @@ class RigSimulator:
         self.faults.add(fault)
 
     def in_instrument_frame_mm(self, place_mm: Floats) -> Floats:
-        """(3,) a place as the station would give it: its horizontal circle may have been set to another zero."""
+        """Return a (3,) position in the instrument's frame, which follows the current zero of the horizontal circle."""
         zero = math.radians(self.station.circle_zero_deg)
         east, north, up = place_mm
         turned = (east * math.cos(zero) - north * math.sin(zero), north * math.cos(zero) + east * math.sin(zero), up)
@@ -150,15 +153,15 @@ class RigSimulator:
     # The links
 
     def receive_can(self, frame: Frame, now_s: float) -> None:
-        """Take a frame that the host sent."""
+        """Process a frame sent by the host."""
         self._spread(frame, now_s)
 
     def receive_station(self, data: bytes, now_s: float) -> None:
-        """Take bytes that the host wrote to the station."""
+        """Process bytes that the host wrote to the station."""
         self.station.receive(data, now_s)
 
     def put(self, frame: Frame) -> None:
-        """Put a frame on the bus that no node answers (an error frame)."""
+        """Put a frame on the bus that no node processes (an error frame)."""
         self._output.frames.append(frame)
 
     def tell(self, event: Event) -> None:
@@ -166,7 +169,7 @@ class RigSimulator:
         self._output.events.append(event)
 
     def _spread(self, frame: Frame, now_s: float) -> None:
-        """Let every node hear a frame; nodes answer in the order of their numbers."""
+        """Deliver a frame to every node; nodes answer in the order of their numbers."""
         for index, node in enumerate(self.nodes, 1 if self._controller else 0):
             answers = node.receive(frame, now_s)
             if answers:
@@ -174,7 +177,7 @@ class RigSimulator:
             self._due[index] = node.next_deadline()
 
     def _emit(self, frames: Sequence[Frame], now_s: float) -> None:
-        """Frames of a device: the host gets them, and the bus master hears them."""
+        """Deliver frames from a device to the host and to the bus master."""
         self._output.frames.extend(frames)
         if self._controller is not None:
             for frame in frames:
@@ -184,7 +187,7 @@ class RigSimulator:
     # Time
 
     def poll(self, now_s: float) -> Output:
-        """Live up to now; returns what came out since the last call."""
+        """Simulate up to `now_s`; return the output since the last call."""
         for fault in self.faults.due(now_s):
             apply_fault(self, fault, now_s)
             self._due = [device.next_deadline() for device in self._devices]
@@ -214,7 +217,7 @@ class RigSimulator:
         self._due[index] = device.next_deadline()
 
     def next_deadline(self) -> float:
-        """Instant at which `poll` is due."""
+        """Return the instant at which `poll` is due."""
         arrival = self._arrivals[0][0] if self._arrivals else math.inf
         return min([*self._due, arrival, self.station.next_deadline(), self.faults.next_deadline()])
 
@@ -222,7 +225,7 @@ class RigSimulator:
 def _nodes(
     rig: Rig, machine: Machine, seed: int, mappings: Mapping[int, Sequence[int]] | None
 ) -> tuple[CanopenNode, ...]:
-    """Build the nodes, fresh from the factory if there are no mappings, else commissioned with them."""
+    """Build the nodes, with factory settings if `mappings` is None, else commissioned with the mappings."""
     nodes: list[CanopenNode] = []
     for number, channel in enumerate(rig.channels):
         serial = 100_000 + 1000 * (seed % 1000) + number
@@ -249,11 +252,11 @@ def _nodes(
 
 
 def _source(rig: Rig, machine: Machine, name: str) -> Source:
-    """Source of a channel: its joint, or a plausible signal that no joint follows."""
+    """Return the source of a channel: its joint, or a plausible signal unrelated to any joint."""
     if name in rig.joint_names:
         return partial(machine.joint, name)
     channel = next(c for c in rig.channels if c.name == name)
-    if channel.unit == "mm":  # an extra stroke, as of a rod feed: slow strokes of its own
+    if channel.unit == "mm":  # an extra stroke, such as a rod feed, with slow independent motion
         return lambda t_s: (600.0 + 400.0 * math.sin(t_s / 20.0), 20.0 * math.cos(t_s / 20.0))
     return lambda t_s: (machine.boom_load_bar(t_s) + 0.3 * float(machine.rng.standard_normal()), 0.0)
 
@@ -270,7 +273,7 @@ def _signals(rig: Rig, machine: Machine, seed: int, period_s: float) -> MachineS
     described = [c for c in rig.channels if isinstance(c, DbcSignal)]
     foreign = next((c for c in described if c.dbc.rpartition("/")[2] != "machine.dbc"), None)
     if foreign is not None:
-        raise ValueError(f"channel {foreign.name}: the simulated machine speaks machine.dbc, not {foreign.dbc}")
+        raise ValueError(f"channel {foreign.name}: the simulated machine only sends machine.dbc, not {foreign.dbc}")
     if not described:
         return None
     return MachineSignals(machine.state, np.random.default_rng([seed, 34]), period_s=period_s)

@@ -1,1 +1,1 @@
-"""CAN buses: frames on their way in and out, and the signals in them."""
+"""CAN buses: receiving and sending frames, and decoding the signals in them."""

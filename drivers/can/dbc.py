@@ -1,4 +1,4 @@
-"""DBC files, read by cantools to `SignalChannel`s. See `raw_signal` for the decoding."""
+"""DBC files, parsed by cantools into `SignalChannel`s. See `raw_signal` for the decoding."""
 
 from __future__ import annotations
 
@@ -19,22 +19,22 @@ from drivers.can.raw_signal import BitField, Multiplexing, SignalChannel
 from drivers.errors import DescriptionError
 from drivers.files import read_whole
 
-_FILE_MAX_BYTES = 2 << 20  # cantools takes more than a second for a megabyte
+_FILE_MAX_BYTES = 2 << 20  # cantools needs more than a second per megabyte
 
 _COUNTER_NAME = re.compile(r"counter|alive", re.IGNORECASE)
 _NO_VALUE_TEXT = re.compile(r"^(sna|(signal )?not available|invalid)$", re.IGNORECASE)
 
 _UNIT_SHOWN, _NUMBERS_SHOWN = 20, 8  # characters; numbers
 
-_MESSAGE_MAX_BYTES = 1785  # of J1939's transport protocol
-# cantools takes a second or two for each of these
+_MESSAGE_MAX_BYTES = 1785  # limit of J1939's transport protocol
+# cantools needs one or two seconds at each of these limits
 _WORDS_MAX = 400_000
 _MESSAGES_MAX = 10_000
 _NODES_MAX = 10_000
 _BIT_CHECKS_MAX = 300_000_000
 _BRANCH_CHECKS_MAX = 300_000
 
-# As cantools splits a text, so that nothing goes by unseen: a comment, a string, a number with its sign, a word, a mark
+# Splits the text as cantools does, so that nothing escapes the checks: comment, string, signed number, word, mark
 _TOKEN = re.compile(r'//[^\n]*|"(?:\\"|[^"])*?"|[-+]?\d+\.?\d*(?:[eE][-+]?\d+)?|[A-Za-z0-9_]+|\S')
 _WORD = re.compile(r"\w+|[^\s\w]")
 _NODES = re.compile(r"\bBU_\s*:((?:\s+(?!BU_\s*:)\w+)*)")
@@ -56,10 +56,10 @@ class DbcFile:
     """A DBC file.
 
     Args:
-        path: the file, in Windows' western character set, as DBC files are.
+        path: the file, encoded in Windows-1252 as is usual for DBC files.
 
     Raises:
-        DescriptionError: it cannot be read or is malformed; the message gives line and column, or the signal.
+        DescriptionError: the file cannot be read or is malformed; the message gives line and column, or the signal.
     """
 
     def __init__(self, path: Path) -> None:
@@ -70,10 +70,10 @@ class DbcFile:
             database = cantools.database.load_string(text, database_format="dbc")
         except OSError as error:
             raise DescriptionError(self._where, f"cannot be read: {error.strerror}") from error
-        # Beside its own errors, what cantools lets through from parsing numbers and names
+        # CantoolsError, and the exceptions that cantools lets escape when it parses numbers and names
         except (CantoolsError, ArithmeticError, LookupError, RecursionError, TypeError, ValueError) as error:
             raise DescriptionError(self._where, f"not a valid DBC file: {' '.join(str(error).split())}") from error
-        assert isinstance(database, Database)  # database_format="dbc" gives no other
+        assert isinstance(database, Database)  # the only type that database_format="dbc" returns
         self._database = database
 
     def channel(
@@ -89,37 +89,37 @@ class DbcFile:
     ) -> SignalChannel:
         """Return the channel of a signal.
 
-        "No value" is what the file itself names so (SNA, not available, invalid), FEh and FFh in the most significant
-        byte for 29-bit identifiers (J1939-71), and all ones in unsigned signals of 8 bits and more for 11-bit ones.
-        The message counter is the signal with "counter" or "alive" in its name, if there is exactly one.
+        These values mean "no value": values that the file names SNA, not available or invalid; for 29-bit identifiers
+        FEh and FFh in the most significant byte (J1939-71); for 11-bit identifiers all ones in unsigned signals of 8
+        bits and more. The message counter is the signal with "counter" or "alive" in its name, if there is exactly one.
 
         Args:
-            name: of the channel.
-            unit: of its values.
-            message: name in the file.
-            signal: name in the file.
-            scale: from the file's physical value to `unit`.
+            name: name of the channel.
+            unit: unit of its values.
+            message: name of the message in the file.
+            signal: name of the signal in the file.
+            scale: factor from the file's physical value to `unit`.
             offset: added after `scale`, in `unit`.
-            timeout_s: silent for longer than this is a gap.
+            timeout_s: silence longer than this is a gap.
 
         Raises:
-            DescriptionError: no such message or signal, or one that no classic CAN frame can carry.
+            DescriptionError: the message or signal does not exist, or does not fit in a classic CAN frame.
         """
         declared = self._declared(message, signal)
         return dataclasses.replace(declared, name=name, unit=unit, scale=scale, offset=offset, timeout_s=timeout_s)
 
     def decoding(self, message: str, signal: str) -> str:
-        """Return in a line how a signal's bits become its value.
+        """Return one line that describes how a signal's bits become its value.
 
-        It is the same in every file that reads the same values out of the same frames, whatever else is in the file.
-        Range and message counter are left out: they make gaps in the readings, and no others.
+        The line is the same for all files that decode the same values from the same frames, whatever else they contain.
+        Range and message counter are left out: they only cause gaps and do not change values.
 
         Args:
-            message: name in the file.
-            signal: name in the file.
+            message: name of the message in the file.
+            signal: name of the signal in the file.
 
         Raises:
-            DescriptionError: as `channel`.
+            DescriptionError: see `channel`.
         """
         found = self._declared(message, signal)
         frame = f"{found.arbitration_id:08X}h" if found.is_extended else f"{found.arbitration_id:03X}h"
@@ -132,14 +132,14 @@ class DbcFile:
         return ", ".join(parts)
 
     def _declared(self, message: str, signal: str) -> SignalChannel:
-        """Return the channel as the file declares it."""
+        """Return the channel that the file declares; DescriptionError if its numbers are too large."""
         try:
             return self._read(message, signal)
         except (ArithmeticError, LookupError, ValueError) as error:
             raise DescriptionError(self._where, f"signal {signal!r} cannot be read: {error}") from error
 
     def _read(self, message: str, signal: str) -> SignalChannel:
-        """Return the channel as the file declares it; numbers may be too large to compute with."""
+        """Return the channel that the file declares; an arithmetic error escapes if its numbers are too large."""
         found = self._message(message)
         signals: dict[str, Signal] = {item.name: item for item in found.signals}
         if signal not in signals:
@@ -149,7 +149,7 @@ class DbcFile:
         is_extended = bool(found.is_extended_frame)
         if not (math.isfinite(wanted.scale) and wanted.scale != 0 and math.isfinite(wanted.offset)):
             raise DescriptionError(
-                self._where, f"signal {signal!r}: factor {wanted.scale} and offset {wanted.offset} make no value"
+                self._where, f"signal {signal!r}: factor {wanted.scale} and offset {wanted.offset} are not usable"
             )
         return SignalChannel(
             name=signal,
@@ -178,7 +178,7 @@ class DbcFile:
             known = ", ".join(sorted(item.name for item in self._database.messages)) or "none"
             raise DescriptionError(self._where, f"has no message {name!r}; messages: {known}") from None
         if message.is_fd or message.length > DATA_MAX:
-            raise DescriptionError(self._where, f"message {name!r} has {message.length} bytes, a CAN frame has 8")
+            raise DescriptionError(self._where, f"message {name!r} has {message.length} bytes; a CAN frame has 8")
         return message
 
     def _multiplexing(self, signals: dict[str, Signal], signal: Signal) -> Multiplexing | None:
@@ -186,9 +186,7 @@ class DbcFile:
             return None
         selector = signals[signal.multiplexer_signal]
         if selector.multiplexer_ids:
-            raise DescriptionError(
-                self._where, f"signal {signal.name!r}: a multiplexer behind a multiplexer is not supported"
-            )
+            raise DescriptionError(self._where, f"signal {signal.name!r}: nested multiplexers are not supported")
         return Multiplexing(_field(selector), frozenset(signal.multiplexer_ids))
 
 
@@ -207,7 +205,7 @@ def _place(field: BitField) -> str:
 
 
 def _listed(numbers: Collection[int]) -> str:
-    """Return numbers in a line; of many, how many they are and a digest, which tells them from others."""
+    """Return numbers as one line; if there are many, their count and a digest that identifies the set."""
     text = " ".join(map(str, sorted(numbers)))
     if len(numbers) <= _NUMBERS_SHOWN:
         return text
@@ -219,7 +217,7 @@ def _plain(text: object) -> str:
 
 
 def _field(signal: Signal) -> BitField:
-    # cantools has made sure that it lies in its message
+    # cantools has checked that the signal lies within its message
     is_signed = signal.is_signed and not signal.is_float
     if signal.byte_order == "little_endian":
         return BitField(signal.start, signal.length, "intel", is_signed)
@@ -228,15 +226,15 @@ def _field(signal: Signal) -> BitField:
 
 @dataclass
 class _Size:
-    """Amount of work that checking one message is for cantools.
+    """Quantities that determine how much work cantools needs to check one message.
 
     Attributes:
-        length_bytes: as the file says.
-        signals: how many it has.
-        values: how many values its multiplexers may have.
-        named: how many values of its signals have names, those of multiplexers among them.
-        nested: multiplexers behind multiplexers.
-        repeats: how often these are looked at, for the values of those before them.
+        length_bytes: length that the file declares.
+        signals: number of its signals.
+        values: number of values that its multiplexers may have.
+        named: number of named values of its signals, including those of multiplexers.
+        nested: names of the multiplexers that are themselves multiplexed.
+        repeats: how often cantools checks the nested multiplexers: once for each value of the outer ones.
     """
 
     length_bytes: int = 0
@@ -248,31 +246,31 @@ class _Size:
 
     @property
     def bit_checks(self) -> int:
-        """Bits that are written down: the square of the length for each signal."""
+        """Number of bits that cantools writes: for each signal the square of the length."""
         return self.signals * self.length_bytes**2
 
     @property
     def branch_checks(self) -> int:
-        """Signals and bytes that are looked at, over all ways through the multiplexers."""
+        """Number of signals and bytes that cantools checks, over all combinations of multiplexer values."""
         each = self.repeats * max(1, self.signals + self.length_bytes)
         return (self.values + self.named) * each if self.values > 1 else 0
 
 
 def _check_sizes(text: str, where: str) -> None:
-    """Refuse a file that cantools would need too much time or memory for.
+    """Refuse a file for which cantools would need too much time or memory.
 
     Args:
-        text: the file's.
-        where: its name, for messages.
+        text: content of the file.
+        where: name of the file, for error messages.
 
     Raises:
-        DescriptionError: it would; the message names the message or signal where it is one.
+        DescriptionError: the file is refused; the text names the message or signal if a single one is the cause.
     """
     tokens = (found[0] for found in _TOKEN.finditer(text) if not found[0].startswith("//"))
     text = " ".join('""' if token[0] == '"' else token for token in tokens)
     beyond = _BEYOND.search(text)
     if beyond is not None:
-        raise DescriptionError(where, f"{beyond[0][:40]} is beyond what a number can be")
+        raise DescriptionError(where, f"the number {beyond[0][:40]} is too large or too small")
     sizes: dict[str, _Size] = {}
     size = _Size()
     for found in _SIZES.finditer(text):
@@ -298,7 +296,7 @@ def _check_sizes(text: str, where: str) -> None:
     ):
         raise DescriptionError(
             where,
-            "it describes too much to be read in time; keep the messages that the rig needs in a file of their own",
+            "the file is too large to be read in time; keep only the messages that the rig needs in a separate file",
         )
 
 

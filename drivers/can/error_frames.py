@@ -8,7 +8,7 @@ from drivers.clock import NS_PER_S, Stamp
 from drivers.readings import DeviceEvent, EventKind
 
 ERROR_REPEAT_NS = 10 * NS_PER_S
-"""Errors that do not change the controller's state are reported at most this often, with their count."""
+"""Minimum interval between reports of errors that do not change the controller's state; a report has their count."""
 
 # Error class, in the identifier
 _TX_TIMEOUT = 0x001
@@ -40,11 +40,11 @@ _PROTOCOL_TYPES = {  # data[2]
 }
 
 _STATE_TEXTS = {
-    EventKind.BUS_ERROR_ACTIVE: "the controller is error-active again: the bus works",
-    EventKind.BUS_ERROR_WARNING: "the controller counted over 96 errors: check cabling, termination and bit rate",
+    EventKind.BUS_ERROR_ACTIVE: "the controller is error-active again: the bus works normally",
+    EventKind.BUS_ERROR_WARNING: "the controller's error count reached 96: check cabling, termination and bit rate",
     EventKind.BUS_ERROR_PASSIVE: "the controller is error-passive: check cabling, termination and bit rate",
-    EventKind.BUS_OFF: "the controller is bus-off and takes no part any more: check cabling, termination and bit rate;"
-    " restart-ms of the interface restarts it by itself",
+    EventKind.BUS_OFF: "the controller is bus-off and has stopped communicating: check cabling, termination and bit"
+    " rate; set restart-ms on the interface to restart it automatically",
 }
 
 
@@ -59,13 +59,13 @@ class _Kind:
 class BusErrors:
     """Decoder of the error frames of one link.
 
-    The controller's state is reported when it changes; other errors the first time, and then every ERROR_REPEAT_NS at
-    most, with how many there were since.
+    The controller's state is reported when it changes. Other errors are reported the first time and then at most every
+    ERROR_REPEAT_NS, with their number since the last report.
 
     Attributes:
         link: name of the link.
-        state: the last known state of the controller.
-        count: error frames so far.
+        state: last known state of the controller.
+        count: number of error frames so far.
     """
 
     link: str
@@ -75,7 +75,13 @@ class BusErrors:
     _overflows: _Kind = field(default_factory=_Kind)
 
     def feed(self, stamp: Stamp, error_class: int, data: bytes) -> list[DeviceEvent]:
-        """Return the events of one error frame."""
+        """Return the events of one error frame.
+
+        Args:
+            stamp: when the frame was received.
+            error_class: error class bits from the frame's identifier.
+            data: data of the frame.
+        """
         self.count += 1
         data = data.ljust(8, b"\0")
         events: list[DeviceEvent] = []
@@ -105,7 +111,7 @@ class BusErrors:
 
 
 def _state(error_class: int, controller: int) -> EventKind | None:
-    """Return the state that an error frame announces; None if it announces none."""
+    """Return the state that an error frame announces, or None."""
     if error_class & _BUS_OFF:
         return EventKind.BUS_OFF
     if error_class & _CONTROLLER:
@@ -122,7 +128,7 @@ def _state(error_class: int, controller: int) -> EventKind | None:
 
 
 def _errors(error_class: int, data: bytes) -> list[str]:
-    """Return errors on the wire in words."""
+    """Return descriptions of the errors on the wire."""
     words = []
     if error_class & _TX_TIMEOUT:
         words.append("transmission timed out")
@@ -133,7 +139,7 @@ def _errors(error_class: int, data: bytes) -> list[str]:
     if error_class & _TRANSCEIVER:
         words.append(f"transceiver status {data[4]:02X}h: check the wiring of CAN-H and CAN-L")
     if error_class & _NO_ACKNOWLEDGE:
-        words.append("no node acknowledged a frame: check that others are powered and at the same bit rate")
+        words.append("no node acknowledged a frame: check that other nodes are powered and use the same bit rate")
     if error_class & _BUS_ERROR and not words:
         words.append("bus error")
     return words

@@ -14,7 +14,7 @@ DATA_MAX = 8
 
 
 class Frame(NamedTuple):
-    """One classic CAN frame without its instant.
+    """One classic CAN frame, without a timestamp.
 
     Attributes:
         arbitration_id: 11-bit, or 29-bit if `is_extended`; the error class bits of SocketCAN if `is_error`.
@@ -30,7 +30,7 @@ class Frame(NamedTuple):
 
     @property
     def is_plain(self) -> bool:
-        """True of a data frame with an 11-bit identifier, such as all of CANopen's are."""
+        """True for a data frame with an 11-bit identifier; all CANopen frames are of this kind."""
         return not (self.is_extended or self.is_remote or self.is_error)
 
     def __str__(self) -> str:
@@ -43,7 +43,7 @@ _EFF_FLAG, _RTR_FLAG, _ERR_FLAG = 0x80000000, 0x40000000, 0x20000000
 
 
 def parse_can_frame(datagram: bytes) -> Frame | None:
-    """Parse a `struct can_frame`; None if it is none (CAN FD)."""
+    """Parse a `struct can_frame`; None if the datagram is not one (CAN FD, for example)."""
     if len(datagram) != _CAN_FRAME.size:
         return None
     identifier, length, data = _CAN_FRAME.unpack(datagram)
@@ -62,7 +62,7 @@ def parse_can_frame(datagram: bytes) -> Frame | None:
 
 
 def parse_multicast(datagram: bytes) -> tuple[Frame, float] | None:
-    """Parse a message of `udp_multicast` (a msgpack map) and its timestamp; None if it is no classic CAN frame."""
+    """Parse a message of `udp_multicast` (a msgpack map) and its timestamp; None if it is not a classic CAN frame."""
     try:
         fields = msgpack.unpackb(datagram)
         identifier, data, timestamp = fields["arbitration_id"], fields["data"], float(fields["timestamp"])
@@ -77,8 +77,8 @@ def parse_multicast(datagram: bytes) -> tuple[Frame, float] | None:
     return Frame(identifier, data, bool(is_extended and not is_error), bool(is_remote), bool(is_error)), timestamp
 
 
-# Lines in which slcan adapters tell of errors (Linux, drivers/net/can/slcan), as SocketCAN's error frames say the same:
-# linux/can/error.h. The controller's state -> class bits and data[1]; one error -> class bits, index into data, bits.
+# Lines in which slcan adapters report errors (Linux, drivers/net/can/slcan) -> the same content in SocketCAN's error
+# frames (linux/can/error.h). Controller state -> class bits and data[1]; error -> class bits, index into data, bits.
 _SLCAN_STATES = {b"a": (0x004, 0x40), b"w": (0x004, 0x0C), b"p": (0x004, 0x30), b"b": (0x040, 0x00)}
 _SLCAN_ERRORS = {
     b"a": (0x020, 0, 0x00),
@@ -93,20 +93,20 @@ _SLCAN_ERRORS = {
 
 
 class SlcanLines:
-    """Cuts an adapter's bytes into lines and lines into frames. Pure.
+    """Splits an adapter's bytes into lines and parses these into frames. Pure.
 
     Attributes:
-        malformed: lines that were neither a frame nor an answer to a command.
+        malformed: number of lines that were neither a frame nor an answer to a command.
     """
 
-    # Case tells extended frames (T, R) from standard ones: digits alone may be in either
+    # Upper case marks extended frames (T, R), lower case standard ones. Hexadecimal digits may be in either case.
     _FRAME = re.compile(
         rb"(?:t([0-9A-Fa-f]{3})|T([0-9A-Fa-f]{8})|r([0-9A-Fa-f]{3})|R([0-9A-Fa-f]{8}))([0-8])([0-9A-Fa-f]*)"
     )
     _ANSWER = re.compile(rb"[zZ]|F[0-9A-Fa-f]{2}|[VN].*", re.DOTALL)  # sent, status flags, version or serial number
     _STATE = re.compile(rb"s([awpb])(\d{3})(\d{3})")
     _ERRORS = re.compile(rb"e(\d)([abBcfsoO]+)")
-    _LINE_MAX = 64  # bytes: more without an end is noise
+    _LINE_MAX = 64  # bytes; more without a line end is noise
 
     def __init__(self) -> None:
         self._rest = b""
@@ -114,13 +114,13 @@ class SlcanLines:
 
     def feed(self, data: bytes) -> list[Frame]:
         """Return the frames that these bytes complete."""
-        # BEL is the adapter's "error": it ends a line as CR does
+        # BEL is the adapter's error reply; like CR, it ends a line
         *lines, self._rest = (self._rest + data).replace(b"\a", b"\r").split(b"\r")
         if len(self._rest) > self._LINE_MAX:
             self._rest = b""
             self.malformed += 1
         frames = []
-        for line in (line.strip(b"\n") for line in lines):  # of adapters that end a line with CR and LF
+        for line in (line.strip(b"\n") for line in lines):  # some adapters end a line with CR and LF
             frame = self._frame(line)
             if frame is not None:
                 frames.append(frame)
@@ -139,12 +139,12 @@ class SlcanLines:
             return None
         is_remote = bool(remote_standard or remote_extended)
         end = 0 if is_remote else 2 * int(length)
-        if len(digits) not in (end, end + 4):  # with the adapter's time stamp switched on, four digits more
+        if len(digits) not in (end, end + 4):  # four more digits if the adapter's timestamps are on
             return None
         return Frame(identifier, bytes.fromhex(digits[:end].decode("ascii")), is_extended, is_remote)
 
     def _error_frame(self, line: bytes) -> Frame | None:
-        """Return the error frame that an adapter's line about errors stands for; None if it is no such line."""
+        """Return the error frame equivalent to an adapter's error line; None if the line is not one."""
         data = bytearray(8)
         if state := self._STATE.fullmatch(line):
             identifier, data[1] = _SLCAN_STATES[state[1]]

@@ -1,6 +1,6 @@
 """SAE J1939-21: the parts of a 29-bit identifier.
 
-Nothing in an identifier tells that its bus is a J1939 bus: on another, these numbers mean nothing.
+An identifier does not show whether its bus is a J1939 bus. On other buses these numbers have no meaning.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from drivers.can.frame import EXTENDED_ID_MAX
 
 GLOBAL_ADDRESS = 0xFF
-_PDU2_FIRST_FORMAT = 240  # from here on the second byte is part of the PGN, below it is the destination
+_PDU2_FIRST_FORMAT = 240  # from this format on, PDU specific is part of the PGN; below, the destination
 
 _NAMES = {
     0xEA00: "request",
@@ -23,13 +23,13 @@ _NAMES = {
 
 @dataclass(frozen=True, slots=True)
 class J1939Id:
-    """A 29-bit identifier taken apart: priority << 26 | EDP, DP << 24 | PDU format << 16 | PDU specific << 8 | source.
+    """The parts of a 29-bit identifier: priority << 26 | EDP, DP << 24 | PDU format << 16 | PDU specific << 8 | source.
 
     Attributes:
-        priority: 0 (first) to 7.
-        pgn: parameter group number, 18 bits; its low byte is 0 where the message has a destination.
+        priority: 0 (highest) to 7.
+        pgn: parameter group number, 18 bits; its low byte is 0 if the message has a destination.
         source: address of the sender.
-        destination: address of the receiver, GLOBAL_ADDRESS for all; None for groups that have none (broadcast).
+        destination: address of the receiver, or GLOBAL_ADDRESS for all; None for groups without one (broadcast).
     """
 
     priority: int
@@ -39,13 +39,13 @@ class J1939Id:
 
     @classmethod
     def parse(cls, arbitration_id: int) -> J1939Id:
-        """Take an identifier apart.
+        """Split an identifier into its parts.
 
         Raises:
-            ValueError: it has more than 29 bits.
+            ValueError: the identifier has more than 29 bits.
         """
         if not 0 <= arbitration_id <= EXTENDED_ID_MAX:
-            raise ValueError(f"{arbitration_id:X}h is no identifier of 29 bits")
+            raise ValueError(f"{arbitration_id:X}h is not a 29-bit identifier")
         group = arbitration_id >> 8 & 0x3FFFF
         is_broadcast = group >> 8 & 0xFF >= _PDU2_FIRST_FORMAT
         return cls(

@@ -1,9 +1,9 @@
 """Ports to a CAN bus. python-can opens, configures, sends and closes; received frames are read from its descriptor.
 
-python-can's own `recv` computes its time-out on the wall clock, builds and logs an object for every frame and hides the
-kernel's count of lost frames. A port therefore waits on the file descriptor that `fileno()` gives (duplicated, so that
-each side closes its own) and parses what arrives: SocketCAN's `can_frame`, the datagrams of `udp_multicast`, the lines
-of slcan. The in-process bus `virtual` has no descriptor; its public queue is read.
+python-can's own `recv` computes its timeout on the wall clock, builds and logs an object for every frame and hides the
+kernel's count of lost frames. A port therefore waits on the file descriptor that `fileno()` returns (duplicated, so
+that each side closes its own) and parses what arrives: SocketCAN's `can_frame`, the datagrams of `udp_multicast`, the
+lines of slcan. The in-process bus `virtual` has no descriptor; its public queue is read instead.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ from drivers.last_reads import more_may_wait
 
 Interface = Literal["socketcan", "virtual", "udp_multicast", "slcan"]
 
-ADAPTER_READY_S = 1.2  # after its port was opened: some slcan adapters start anew then; with the rest under 2 s
+ADAPTER_READY_S = 1.2  # wait after opening the port, as some slcan adapters restart then; opening takes under 2 s
 BATCH_MAX = 512  # frames per read, so that a flooded bus cannot keep the loop from its other duties
-GATHER_S = 0.005  # frames that come so soon after the first are read with it: waking up costs as much as some of them
+GATHER_S = 0.005  # frames this soon after the first are read together with it, as each wake-up costs as much as a few
 
 # Linux, include/uapi/asm-generic/socket.h; Python's socket module does not name them
 SO_RCVBUFFORCE = 33
@@ -52,12 +52,12 @@ _ANCILLARY_BYTES = socket.CMSG_SPACE(_TIMESPEC.size) + socket.CMSG_SPACE(_DROPS.
 
 OVERFLOW = "the kernel's receive buffer was full"
 NOT_A_FRAME = "not a classic CAN frame"
-ADAPTER_LINE = "the adapter sent a line that is no frame"
+ADAPTER_LINE = "the adapter sent a line that is not a frame"
 INTERFACE_DROPS = "the interface's statistics show losses"
 
 
 class Received(NamedTuple):
-    """A frame, and when the kernel received it (nanoseconds UTC) where the kernel says so."""
+    """A frame and the kernel's receive time (nanoseconds UTC), or None if the kernel gives none."""
 
     frame: Frame
     kernel_utc_ns: int | None
@@ -68,7 +68,7 @@ class Batch(NamedTuple):
 
     Attributes:
         received: the frames, in order.
-        is_last: nothing was left to be read.
+        is_last: nothing was left to read.
     """
 
     received: list[Received]
@@ -77,19 +77,19 @@ class Batch(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class CanLinkConfig:
-    """A CAN link.
+    """Configuration of a CAN link.
 
     Attributes:
-        name: of the link, as channels name it.
+        name: name of the link, by which channels refer to it.
         interface: `socketcan`, `slcan`, `udp_multicast` (between processes) or `virtual` (within one).
         channel: interface name (`can0`), serial port (`/dev/ttyACM0`), multicast group or any name.
-        bitrate: of the bus, bit/s; set on slcan adapters, a SocketCAN interface is set up by the system.
-        allow_transmit: the link may send at all; without it slcan adapters are opened listen-only.
-        transmit_nodes: nodes that may be addressed.
+        bitrate: bit rate of the bus in bit/s; set on slcan adapters only, as the system sets up SocketCAN interfaces.
+        allow_transmit: the link may send; without it slcan adapters are opened listen-only.
+        transmit_nodes: node IDs that may be addressed.
         own_identifiers: 11-bit identifiers that `publish` may send.
-        sync_period_ms: send SYNC at this period; None: do not.
-        receive_buffer_bytes: of the socket; 4 MiB, doubled by the kernel for its overhead, hold over a second of a
-            saturated 1 Mbit/s bus.
+        sync_period_ms: period at which to send SYNC; None for no SYNC.
+        receive_buffer_bytes: receive buffer of the socket; 4 MiB, doubled by the kernel for its overhead, hold over a
+            second of traffic on a saturated 1 Mbit/s bus.
         options: further arguments of python-can's bus (`port` and `hop_limit` of udp_multicast, `sleep_after_open` of
             slcan, ...).
     """
@@ -112,7 +112,7 @@ def open_port(config: CanLinkConfig) -> CanPort:
     A link that may not transmit opens an slcan adapter listen-only: it does not even acknowledge frames.
 
     Raises:
-        LinkError: with what the operator can do.
+        LinkError: the port cannot be opened; the message states what the operator can do.
     """
     arguments = dict(config.options)
     if config.interface == "slcan":
@@ -144,7 +144,7 @@ def _port(bus: can.BusABC, config: CanLinkConfig) -> CanPort:
 
 
 def _message_of(error: BaseException) -> str:
-    """Return the system's reason in its words alone, where there is one; libraries quote it with the path, twice."""
+    """Return the system's error text if there is one, without the repeated paths that libraries add to it."""
     cause = error.__cause__ or error
     if isinstance(cause, OSError) and cause.errno is not None and cause.errno > 0:
         return os.strerror(cause.errno)
@@ -153,17 +153,17 @@ def _message_of(error: BaseException) -> str:
 
 def _hint(config: CanLinkConfig, error: BaseException) -> str:
     if isinstance(error, OSError) and error.errno == errno.EAFNOSUPPORT:
-        return "the kernel has no CAN support here: load it with `modprobe can_raw`, for a container on its host"
+        return "the kernel has no CAN support loaded: run `modprobe can_raw` (in a container: on its host)"
     if config.interface == "socketcan":
         mode = f"bitrate {config.bitrate or 250_000} listen-only {'off' if config.allow_transmit else 'on'}"
         return f"try: ip link set {config.channel} up type can {mode} restart-ms 100"
     if config.interface == "slcan":
-        return "check that the adapter is plugged in, that this user may use the port, and the bitrate"
+        return "check that the adapter is plugged in, that this user may access the port, and that the bitrate is right"
     return "check the channel and the options of the link"
 
 
 class CanPort(abc.ABC):
-    """An open port to a bus; python-can sends and closes. Any failure of the bus or its adapter is a LinkError."""
+    """An open port to a bus; python-can sends and closes. Every failure of the bus or its adapter raises LinkError."""
 
     def __init__(self, where: str, bus: can.BusABC) -> None:
         self._where = where
@@ -175,7 +175,7 @@ class CanPort(abc.ABC):
         """Return up to BATCH_MAX frames; wait for at most `timeout_s` real seconds for the first."""
 
     def fileno(self) -> int:
-        """Return the descriptor that is readable when a frame has come; LinkError where there is none (`virtual`)."""
+        """Return the descriptor that becomes readable when a frame arrives; LinkError if there is none (`virtual`)."""
         raise LinkError(self._where, "an in-process bus has no descriptor")
 
     def send(self, frame: Frame) -> None:
@@ -207,18 +207,18 @@ class CanPort(abc.ABC):
         self._losses[reason] = self._losses.get(reason, 0) + count
 
     def _gone(self, error: BaseException) -> LinkError:
-        return LinkError(self._where, f"the bus went away: {_message_of(error)}")
+        return LinkError(self._where, f"connection to the bus lost: {_message_of(error)}")
 
 
 class _DatagramPort(CanPort):
-    """Base of the ports on a socket, where every datagram is a frame. The kernel stamps it, whenever it is read."""
+    """Base of the ports on a socket, where every datagram is a frame, timestamped by the kernel on arrival."""
 
     def __init__(self, where: str, bus: can.BusABC, descriptor: socket.socket, receive_buffer_bytes: int) -> None:
         super().__init__(where, bus)
         self._socket = descriptor
         self._failure: LinkError | None = None
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, receive_buffer_bytes)
-        with contextlib.suppress(PermissionError):  # beyond net.core.rmem_max, with CAP_NET_ADMIN
+        with contextlib.suppress(PermissionError):  # may exceed net.core.rmem_max, but needs CAP_NET_ADMIN
             self._socket.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, receive_buffer_bytes)
         self._socket.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
         self._socket.setsockopt(socket.SOL_SOCKET, SO_RXQ_OVFL, 1)
@@ -260,7 +260,7 @@ class _DatagramPort(CanPort):
                 received.append(Received(frame, kernel_utc_ns))
         else:
             is_last = not ready
-        # The kernel reports a failure once, before the frames that came before it, and these are given first
+        # The kernel reports a failure once, ahead of the frames that arrived before it; return those frames first
         if self._failure is not None and not received:
             raise self._failure
         return Batch(received, is_last)
@@ -271,7 +271,7 @@ class _DatagramPort(CanPort):
 
     @abc.abstractmethod
     def _parse(self, datagram: bytes) -> Frame | None:
-        """Return the frame of a datagram; None, and counted as lost, if it is none."""
+        """Return the frame of a datagram; if it is not a frame, count it as lost and return None."""
 
     def _count_overflows(self, total: int) -> None:
         if total != self._overflows:
@@ -280,7 +280,7 @@ class _DatagramPort(CanPort):
 
 
 class SocketCanPort(_DatagramPort):
-    """A SocketCAN interface: raw socket, error frames on."""
+    """A SocketCAN interface: a raw socket that also receives error frames."""
 
     def __init__(
         self,
@@ -306,7 +306,11 @@ class SocketCanPort(_DatagramPort):
 
 
 def interface_drops(statistics: Path) -> int:
-    """Count the frames that the interface itself lost (/sys/class/net/<interface>/statistics; 0 without any)."""
+    """Return the number of frames that the interface itself lost.
+
+    Args:
+        statistics: directory /sys/class/net/<interface>/statistics; counters that are missing there count as 0.
+    """
     total = 0
     for name in ("rx_dropped", "rx_fifo_errors", "rx_missed_errors", "rx_over_errors"):
         with contextlib.suppress(OSError, ValueError):
@@ -317,7 +321,8 @@ def interface_drops(statistics: Path) -> int:
 class MulticastPort(_DatagramPort):
     """python-can's `udp_multicast`: a bus between processes, for simulators.
 
-    The kernel gives a sender its own datagrams back. A message's timestamp, which receivers do not use, marks them.
+    The kernel delivers a sender's datagrams back to it. They are recognized by the message's timestamp, which receivers
+    do not use otherwise.
     """
 
     _serial = itertools.count(1)
@@ -327,7 +332,7 @@ class MulticastPort(_DatagramPort):
         self._sent: deque[float] = deque(maxlen=1024)
 
     def _send(self, message: can.Message) -> None:
-        # Negative, which no time is, and of this process: process identifiers have at most 22 bits
+        # Negative, so that it cannot be a real time, and unique to this process: process IDs have at most 22 bits
         message.timestamp = -(next(self._serial) + os.getpid() / (1 << 22))
         self._sent.append(message.timestamp)
         super()._send(message)
@@ -348,7 +353,7 @@ class SlcanPort(CanPort):
         super().__init__(where, bus)
         self._serial = bus.serialPortOrig
         self._fd = bus.fileno()
-        # Two readers on one port get half of the bytes each
+        # Exclusive access: two readers on one port would each get half of the bytes
         fcntl.ioctl(self._fd, termios.TIOCEXCL)
         self._lines = SlcanLines()
 
@@ -363,7 +368,7 @@ class SlcanPort(CanPort):
         except OSError as error:
             raise self._gone(error) from error
         if not data:
-            raise LinkError(self._where, "the bus went away: the adapter was unplugged")
+            raise LinkError(self._where, "connection to the bus lost: the adapter was unplugged; plug it in again")
         frames = self._lines.feed(data)
         if self._lines.malformed:
             self._count_lost(ADAPTER_LINE, self._lines.malformed)

@@ -1,4 +1,4 @@
-"""Decoder of signals at a fixed place of a CAN frame, as a DBC or a rig file describes them."""
+"""Decoder of signals at a fixed position in a CAN frame, as described by a DBC or a rig file."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ _FLOATS = {16: ("<e", 2), 32: ("<f", 4), 64: ("<d", 8)}
 
 @dataclass(frozen=True, slots=True)
 class BitField:
-    """A place in a frame.
+    """The position of a field in a frame.
 
     Attributes:
-        start_bit: numbered as in a DBC: bit n is bit n % 8 of byte n // 8. For `intel` (little endian) the least
-            significant bit of the signal, for `motorola` (big endian) the most significant.
+        start_bit: numbered as in a DBC: bit n is bit n % 8 of byte n // 8. It is the signal's least significant bit
+            for `intel` (little endian) and its most significant bit for `motorola` (big endian).
         length_bits: 1 to 64.
         byte_order: `intel` or `motorola`.
         is_signed: two's complement.
 
     Raises:
-        ValueError: the field does not lie in a frame of 8 bytes.
+        ValueError: the field does not fit in a frame of 8 bytes.
     """
 
     start_bit: int
@@ -39,23 +39,23 @@ class BitField:
     def __post_init__(self) -> None:
         if self.start_bit < 0 or self.length_bits < 1 or self.end_bit > 8 * DATA_MAX:
             raise ValueError(
-                f"{self.length_bits} bits at {self.byte_order} bit {self.start_bit} do not lie in a frame of 8 bytes"
+                f"{self.length_bits} bits at {self.byte_order} bit {self.start_bit} do not fit in a frame of 8 bytes"
             )
 
     @property
     def end_bit(self) -> int:
-        """Number of bits that a frame must have to carry it."""
+        """Number of bits that a frame must have to hold the field."""
         return self._first_bit + self.length_bits
 
     @property
     def _first_bit(self) -> int:
-        """Bits before it in the order in which its byte order counts."""
+        """Number of bits before the field, counted in its byte order."""
         if self.byte_order == "intel":
             return self.start_bit
         return self.start_bit // 8 * 8 + 7 - self.start_bit % 8
 
     def extract(self, data: bytes) -> int | None:
-        """Return the unsigned integer at this place; None if the frame is too short."""
+        """Return the field's content as an unsigned integer; None if the frame is too short."""
         size = len(data) * 8
         if size < self.end_bit:
             return None
@@ -64,7 +64,7 @@ class BitField:
         return int.from_bytes(data, "big") >> size - self.end_bit & ((1 << self.length_bits) - 1)
 
     def as_signed(self, counts: int) -> int:
-        """Convert the integer at this place as `is_signed` says."""
+        """Convert the field's unsigned content to a signed integer if `is_signed`; else return it unchanged."""
         if not self.is_signed:
             return counts
         half = 1 << self.length_bits - 1
@@ -84,22 +84,22 @@ class SignalChannel:
     """A signal of a frame: value = (counts * factor + summand) * scale + offset.
 
     Attributes:
-        name: the signal.
+        name: name of the signal.
         unit: unit of the value.
-        arbitration_id, is_extended: the frame.
-        field: its place in the frame.
+        arbitration_id, is_extended: identifier of the frame.
+        field: position of the signal in the frame.
         is_float: the field is an IEEE 754 number of 16, 32 or 64 bits.
-        factor, summand: to the physical value of the message's description.
-        scale, offset: from there to the channel's unit.
-        minimum, maximum: declared range of the physical value; None where none is declared.
-        not_available: integers that mean "no value", read as the field is signed or not.
-        all_ones_is_not_available: unsigned fields of 8 bits and more: all bits set means "no value".
-        is_j1939: unsigned fields follow J1939-71: most significant byte FFh "not available", FEh "error"; fields of
-            2 to 7 bits: all bits set, and one less.
+        factor, summand: conversion from counts to the physical value of the message's description.
+        scale, offset: conversion from the physical value to the channel's unit.
+        minimum, maximum: declared range of the physical value; None if none is declared.
+        not_available: integers that mean "no value", signed if the field is.
+        all_ones_is_not_available: in unsigned fields of 8 bits and more, all bits set means "no value".
+        is_j1939: unsigned fields follow J1939-71: a most significant byte of FFh means "not available", FEh "error"; in
+            fields of 2 to 7 bits the largest value and the one below mean the same.
         counter: a message counter in the same frame that rises by one with every frame.
-        multiplexing: when the signal is there; None: always.
-        timeout_s: silent for longer than this is a gap.
-        max_rate_per_s: fastest motion of the joint in units per second; None: jumps are not looked for.
+        multiplexing: condition under which the frame contains the signal; None if it always does.
+        timeout_s: silence longer than this is a gap.
+        max_rate_per_s: fastest motion of the joint in units per second; None to skip the check for jumps.
     """
 
     name: str
@@ -126,19 +126,20 @@ class SignalChannel:
 class SignalDecoder:
     """Decoder of one `SignalChannel`.
 
-    Frames missing by the message counter are a closed gap. A counter that stands still tells nothing (the frame was
-    repeated, or its sender does not count), and neither does one after a silence that was itself a gap.
+    Frames that are missing according to the message counter are recorded as a closed gap. No loss is derived from a
+    counter that does not change (the frame was repeated, or its sender does not count) or from the first count after a
+    silence that was itself a gap.
 
     Attributes:
-        missed_frames: missing so far by the message counter; None until it has been seen to count.
+        missed_frames: number of missing frames so far; None until the message counter has been seen to count.
 
     Raises:
-        DescriptionError: a float field has no length of IEEE 754.
+        DescriptionError: the length of a float field is not one of IEEE 754.
     """
 
     def __init__(self, channel: SignalChannel) -> None:
         if channel.is_float and channel.field.length_bits not in _FLOATS:
-            raise DescriptionError(channel.name, f"a float of {channel.field.length_bits} bits does not exist")
+            raise DescriptionError(channel.name, f"a float of {channel.field.length_bits} bits is not supported")
         self.name = channel.name
         self.arbitration_id = channel.arbitration_id
         self.is_extended = channel.is_extended
@@ -207,11 +208,11 @@ class SignalDecoder:
 
 
 def _j1939_reserved(field: BitField) -> tuple[int, int]:
-    """Return the integers that J1939-71 reserves at the top of a field ("error", and above it "not available").
+    """Return the range that J1939-71 reserves at the top of a field ("error", and above it "not available").
 
     Returns:
-        (shift, lowest): `counts >> shift >= lowest` for the reserved ones.
+        (shift, lowest): an integer is reserved if `counts >> shift >= lowest`.
     """
     significant = min(field.length_bits, 8)
-    lowest = (1 << significant) - 2 if field.length_bits >= 2 else 2  # a single bit has both values
+    lowest = (1 << significant) - 2 if field.length_bits >= 2 else 2  # a single bit has no reserved value
     return field.length_bits - significant, lowest

@@ -1,4 +1,4 @@
-"""Stamps of received frames: the kernel's wall-clock time put on the link's own clock."""
+"""Stamps of received frames: the kernel's wall-clock time converted to the link's own clock."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ from drivers.can.ports import Batch
 from drivers.clock import Clock, Stamp
 
 EXACT_NS = 1_000_000
-"""UTC that is ahead of the monotonic clock by so much more or less has been set; less is the error of reading both."""
+"""A larger change of UTC minus monotonic clock means that the wall clock was set; less is the error of reading both."""
 
 _NEVER_NS = 1 << 63
 
 
 @dataclass(slots=True)
 class _Epoch:
-    """A time in which the wall clock was not set (monotonic instants, ns).
+    """A period during which the wall clock was not set (monotonic instants, ns).
 
     Attributes:
-        ahead_ns: UTC less the monotonic clock.
-        since_ns, until_ns: it cannot have begun before, nor have ended after.
+        ahead_ns: UTC minus the monotonic clock.
+        since_ns, until_ns: earliest possible start and latest possible end.
     """
 
     ahead_ns: int
@@ -32,36 +32,38 @@ class _Epoch:
 
 
 class ReceiveStamps:
-    """Stamps what a link reads.
+    """Timestamps the frames that a link reads.
 
-    The kernel's own receive time is better than that of reading by all that the scheduler adds, but it is on the wall
-    clock. Between two settings of the wall clock (Linux slews both clocks alike) UTC is ahead of the monotonic clock by
-    a constant. It is looked at before and after every read, so each setting is known to lie between two looks, and a
-    frame's instant is the one that its kernel's time gives before or after the setting, whichever is possible: later
-    than the start of the last read that left nothing, not later than now, and on its side of the setting. Where both
-    are, or none is, the time of the frame is doubtful. How late it is read does not matter.
+    The kernel's receive time is better than the time of reading, as it contains no scheduling delay, but it is on the
+    wall clock. Between two settings of the wall clock, UTC is ahead of the monotonic clock by a constant (Linux slews
+    both clocks alike). This offset is checked before and after every read, so each setting is known to lie between two
+    checks. With the offset before the setting and the offset after it, the kernel's time of a frame gives two candidate
+    instants. A candidate is possible if it is later than the start of the last read that left nothing unread, not later
+    than now, and on its own side of the setting. If exactly one candidate is possible, it is the frame's instant;
+    otherwise the time of the frame is doubtful. How late the frame is read does not matter.
 
-    Two kinds of frames have no time but that of reading, which is doubtful after a while in which nobody read: those
-    of ports that the kernel does not stamp; and those that it stamps only when they are read, as it does on sockets
-    within the host and until stamping is switched on. The latter never seem older than the read, so what seems to have
-    come during a late read is believed only if an older frame has shown that this socket is stamped.
+    Two kinds of frames only have the time of reading, which is doubtful if the port was not read for a while: frames of
+    ports without kernel timestamps, and frames that the kernel timestamps only when they are read (on sockets within
+    the host, and until timestamping is switched on). Frames of the second kind never appear older than the read. A
+    frame that appears to have arrived during a late read is therefore trusted only if an older frame has shown that
+    this socket is timestamped on arrival.
 
-    Stamps never go back. A frame of doubtful time is stamped at the earliest instant that is possible, if the kernel
-    has stamped it, so that it does not hold up those behind it; else when it was read.
+    Stamps never go back. A frame of doubtful time gets the earliest possible instant if the kernel has timestamped it,
+    so that it does not delay the stamps of the frames behind it; otherwise it gets the time of reading.
 
     Args:
-        clock: of the link.
+        clock: clock of the link.
         opened: the host's time just before the port was opened.
 
     Attributes:
-        latest: the last stamp that was given; the opening before the first.
+        latest: the last stamp returned; before the first, the time of opening.
     """
 
     def __init__(self, clock: Clock, opened: Stamp) -> None:
         self._clock = clock
         self._epochs = [_Epoch(opened.utc_ns - opened.monotonic_ns, opened.monotonic_ns)]
         self._looked_ns = opened.monotonic_ns
-        self._floor_ns = opened.monotonic_ns  # what is still to be read has arrived after this
+        self._floor_ns = opened.monotonic_ns  # all unread frames arrived after this instant
         self._is_stamped = False
         self.latest = clock.of_host(opened)
 
@@ -72,7 +74,7 @@ class ReceiveStamps:
             batch: the frames.
             began: the host's time just before the read.
             ended: the host's time just after the read.
-            is_late: they may have waited long, as nobody read.
+            is_late: the frames may have waited long, because the port was not read.
         """
         self._look(began)
         self._look(ended)
@@ -91,7 +93,7 @@ class ReceiveStamps:
         return stamps
 
     def _look(self, host: Stamp) -> None:
-        """Notice that the wall clock was set."""
+        """Check whether the wall clock was set since the last check, and begin a new epoch if so."""
         ahead_ns = host.utc_ns - host.monotonic_ns
         epoch = self._epochs[-1]
         if abs(ahead_ns - epoch.ahead_ns) > EXACT_NS:
@@ -100,7 +102,7 @@ class ReceiveStamps:
         self._looked_ns = host.monotonic_ns
 
     def _stamp(self, kernel_utc_ns: int, began: Stamp, ended: Stamp, is_late: bool) -> Stamp:
-        """The instant of a frame, on the host's clocks."""
+        """Return the stamp of a frame on the host's clocks."""
         floor_ns, ended_ns = self._floor_ns, ended.monotonic_ns
         earliest_ns, latest_ns = floor_ns - EXACT_NS, ended_ns + EXACT_NS
         possible = [

@@ -1,4 +1,4 @@
-"""Summary of a CAN link by identifier: counts, rates, ages and frames known to be missing."""
+"""Summary of a CAN link by identifier: counts, rates, ages and known losses of frames."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ class IdSummary:
 
     Attributes:
         arbitration_id, is_extended: the identifier.
-        names: the channels it feeds; for others what the identifier says of itself, "" if nothing.
-        count: frames since the start.
-        rate_per_s: over about the last 10 s; None before it is known.
-        age_s: since the last frame; None if there was none.
-        missed: frames that did not arrive since the start, by the counter that they carry; None if they carry none
-            that counts.
+        names: the channels that use it; for other identifiers the meaning that it shows itself, or "".
+        count: number of frames since the start.
+        rate_per_s: rate over about the last 10 s; None until it is known.
+        age_s: time since the last frame; None if there was none.
+        missed: number of frames lost since the start according to the frames' message counter; None if they have no
+            working counter.
     """
 
     arbitration_id: int
@@ -40,10 +40,10 @@ class CanSummary:
     """Counts of one link.
 
     Attributes:
-        link: its name.
-        ids: in the order of the identifiers; those of channels are there even if they were never heard.
-        unlisted_frames: frames of identifiers that are too many to be counted one by one.
-        error_frames: error frames since the start.
+        link: name of the link.
+        ids: sorted by identifier; includes the identifiers of channels that were never received.
+        unlisted_frames: number of frames with identifiers beyond those that are counted one by one.
+        error_frames: number of error frames since the start.
     """
 
     link: str
@@ -53,7 +53,7 @@ class CanSummary:
 
 
 class RateWindow:
-    """Counts as they were at instants a second or more apart, for RATE_WINDOW_NS."""
+    """Snapshots of counts, a second or more apart, over the last RATE_WINDOW_NS."""
 
     def __init__(self) -> None:
         self._marks: deque[tuple[Stamp, Mapping[int, int]]] = deque()
@@ -63,7 +63,7 @@ class RateWindow:
         return not self._marks or not 0 <= now.since(self._marks[-1][0]) < _MARK_NS
 
     def mark(self, now: Stamp, counts: Mapping[int, int]) -> None:
-        """Store the current counts, and drop those that are too old."""
+        """Store a snapshot of the current counts (key -> count) and discard those that are too old."""
         marks = self._marks
         if marks and now.since(marks[-1][0]) < 0:
             marks.clear()
@@ -72,7 +72,7 @@ class RateWindow:
             marks.popleft()
 
     def rates_per_s(self) -> dict[int, float]:
-        """Return the rate by key at the last mark; empty before the second."""
+        """Return the rate by key at the last snapshot; empty before the second."""
         if len(self._marks) < 2:
             return {}
         (first, before), (last, after) = self._marks[0], self._marks[-1]

@@ -1,7 +1,7 @@
 """Encoder of the corrected tip as CAN frames; `tip.dbc` and docs/reference/tip-frames.md describe them.
 
-Two frames with consecutive 11-bit identifiers carry one tip; both have its counter and its status, so that a receiver
-can pair them. Lengths are in 0.1 mm, little-endian, in the base frame.
+Two frames with consecutive 11-bit identifiers carry one tip. Both contain its counter and its status, so that a
+receiver can pair them. Lengths are in 0.1 mm, little-endian, in the base frame.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from enum import IntEnum
 
 from drivers.can.frame import Frame
 
-FRAMES = 2  # identifiers that one tip takes, from the configured one on
+FRAMES = 2  # number of identifiers used by one tip, starting with the configured one
 UNIT_MM = 0.1
 COORDINATE_MAX = 2**23 - 1
 NO_COORDINATE = -(2**23)
@@ -36,7 +36,7 @@ class TipStatus(IntEnum):
 
     @property
     def has_position(self) -> bool:
-        """True if a position comes with it."""
+        """True if a tip with this status has a position."""
         return self < TipStatus.NO_MODEL
 
 
@@ -45,10 +45,10 @@ class TipMessage:
     """A tip to be sent.
 
     Attributes:
-        status: what it is worth.
+        status: validity of the tip.
         position_mm: x, y, z in the base frame; None without a position.
-        sigma_mm: RMS of the 3-D error to be expected of it.
-        age_s: how long ago the joints were read; clocks may differ so that it is a little below 0, sent as 0.
+        sigma_mm: expected RMS of the position's 3-D error.
+        age_s: time since the joints were read; slightly negative if clocks differ, and then sent as 0.
     """
 
     status: TipStatus
@@ -60,13 +60,13 @@ class TipMessage:
 def encode_tip(message: TipMessage, arbitration_id: int, counter: int) -> list[Frame]:
     """Encode one tip as two frames.
 
-    A position that the frames cannot hold (838 m and more from the base, or no number) is sent as FAILED without one; a
-    sigma or an age that is not known, no number, or beyond its range is sent as the greatest value.
+    If the frames cannot hold the position (838 m or more from the base, or NaN), status FAILED is sent without a
+    position. A sigma or an age that is unknown, NaN or out of range is sent as the largest value.
 
     Args:
         message: the tip.
-        arbitration_id: of the first frame; the second has the next one.
-        counter: of tips sent so far; its last 8 bits are sent.
+        arbitration_id: identifier of the first frame; the second frame has the next one.
+        counter: number of tips sent so far; its last 8 bits are sent.
     """
     status, coordinates = message.status, (NO_COORDINATE,) * 3
     sigma, age = NO_SIGMA, NO_AGE
@@ -87,7 +87,7 @@ def encode_tip(message: TipMessage, arbitration_id: int, counter: int) -> list[F
 
 
 def _counts(value: float | None, unit: float, most: int) -> int:
-    """Return the whole units in a value, 0 to `most`; `most` where it is not known or no number."""
+    """Return a value in whole units, limited to 0 to `most`; `most` if the value is None or NaN."""
     if value is None or math.isnan(value):
         return most
     return round(min(max(value / unit, 0.0), most))

@@ -1,4 +1,4 @@
-"""CiA 301, the CANopen base protocol: identifiers, NMT, heartbeat. SYNC, EMCY, SDO and PDO have files of their own."""
+"""CiA 301, the CANopen base protocol: identifiers, NMT, heartbeat. SYNC, EMCY, SDO and PDO are separate modules."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ class Service(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class CobId:
-    """A COB-ID taken apart.
+    """The parts of a COB-ID.
 
     Attributes:
-        service: which service uses it.
-        node: the node it belongs to; None for the broadcast services.
+        service: service that uses it.
+        node: node that it belongs to; None for the broadcast services.
     """
 
     service: Service
@@ -114,7 +114,7 @@ class NmtState(IntEnum):
 
     @property
     def words(self) -> str:
-        """The state as an operator reads it."""
+        """The state in words, for messages to operators."""
         return self.name.lower().replace("_", "-")
 
 
@@ -124,14 +124,14 @@ def encode_nmt(command: NmtCommand, node: int) -> Frame:
 
 
 def decode_heartbeat(data: bytes) -> NmtState:
-    """Decode the state in a heartbeat, boot-up or node-guarding answer (whose toggle bit 7 is left out).
+    """Decode the state in a heartbeat, boot-up message or node-guarding answer (ignoring the latter's toggle bit 7).
 
     Raises:
-        ValueError: not one byte, or no state of CiA 301.
+        ValueError: `data` is not one byte, or its state is not one of CiA 301.
     """
     if len(data) != 1:
-        raise ValueError(f"a heartbeat has 1 byte, this has {len(data)}")
+        raise ValueError(f"a heartbeat has 1 byte, this one has {len(data)}")
     try:
         return NmtState(data[0] & 0x7F)
     except ValueError:
-        raise ValueError(f"{data[0]:02X}h is no NMT state (00, 04, 05, 7F)") from None
+        raise ValueError(f"{data[0]:02X}h is not an NMT state (00, 04, 05, 7F)") from None

@@ -20,7 +20,7 @@ INPUT_STATUS = 0x6150
 _LENGTHS = {PROCESS_VALUE_REAL32: 32, PROCESS_VALUE_I16: 16, PROCESS_VALUE_I32: 32}
 
 UNIT_TEXTS = {0x004E0000: "bar", 0x00AB0000: "psi", 0x002D0000: "degC", 0x00AC0000: "degF"}
-"""Object 6131h: the physical units that its values name."""
+"""Value of object 6131h -> physical unit."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,9 +29,9 @@ class AnalogueChannel(PdoChannel):
 
     Attributes:
         process_value: PROCESS_VALUE_REAL32 (6130h), PROCESS_VALUE_I16 (7130h) or PROCESS_VALUE_I32 (9130h).
-        decimal_digits: object 6132h: 1234 with 2 is 12.34; does not apply to REAL32.
-        scale, offset: from the device's unit to the channel's.
-        max_rate_per_s: fastest motion of the joint in units per second; None: jumps are not looked for.
+        decimal_digits: object 6132h: 1234 with 2 digits is 12.34; does not apply to REAL32.
+        scale, offset: conversion from the device's unit to the channel's.
+        max_rate_per_s: fastest motion of the joint in units per second; None to skip the check for jumps.
     """
 
     process_value: int = PROCESS_VALUE_I16
@@ -44,11 +44,11 @@ class AnalogueChannel(PdoChannel):
 class AnalogueDecoder(PdoChannelDecoder):
     """Decoder of one `AnalogueChannel`.
 
-    REAL32 that is infinite or not a number is "not available". Where the PDO carries the input's status (6150h), its
-    overload bits 1 and 2 make the value out of range, and any other set bit makes it not available.
+    A REAL32 value that is infinite or NaN is "not available". If the PDO contains the input's status (6150h), overload
+    bits 1 and 2 make the value out of range, and any other set bit makes it not available.
 
     Raises:
-        DescriptionError: the PDO does not carry the process value in its length.
+        DescriptionError: the PDO does not contain the process value with the right length.
     """
 
     def __init__(self, channel: AnalogueChannel) -> None:

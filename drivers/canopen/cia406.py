@@ -34,7 +34,7 @@ _FLAGS = {
 
 
 def _flag_texts(flags: int, texts: dict[int, str]) -> str:
-    """Return the bits of object 6503h or 6505h in words."""
+    """Return descriptions of the bits set in object 6503h or 6505h."""
     return ", ".join(
         texts.get(bit, f"manufacturer bit {bit}" if bit >= 12 else f"reserved bit {bit}")
         for bit in range(16)
@@ -47,9 +47,9 @@ class PositionChannel(PdoChannel):
     """Settings that encoders and linear transducers share.
 
     Attributes:
-        sign: +1 or -1, the joint's positive direction against counting direction.
-        zero_counts: position at which the joint reads zero.
-        max_rate_per_s: fastest motion of the joint in units per second; None: jumps are not looked for.
+        sign: +1 if the counts rise in the joint's positive direction, -1 if they fall.
+        zero_counts: position in counts at which the joint's value is zero.
+        max_rate_per_s: fastest motion of the joint in units per second; None to skip the check for jumps.
     """
 
     sign: Literal[-1, 1] = 1
@@ -61,8 +61,8 @@ class PositionChannel(PdoChannel):
 class EncoderChannel(PositionChannel):
     """A rotary encoder: value_deg = sign * (counts - zero_counts) * 360 / units_per_revolution.
 
-    The position wraps at `total_units`, and the value to the interval of that width centred on zero. Where
-    `total_units` is a power of two, bits above it are status bits (POSITAL limit switches) and are masked.
+    The position wraps at `total_units`, and the value is wrapped to the interval of that width centred on zero. If
+    `total_units` is a power of two, the bits above it are status bits (POSITAL limit switches) and are masked.
 
     Attributes:
         units_per_revolution: object 6001h, or 6501h when scaling is off.
@@ -81,7 +81,7 @@ class LinearChannel(PositionChannel):
     Attributes:
         position_object: POSITION (6004h) or POSITION_MULTI_SENSOR (6020h).
         step_nm: measuring step, object 6005h.1 or 6501h.
-        range_mm: measuring range; a value beyond it is refused.
+        range_mm: measuring range; a value outside it is OUT_OF_RANGE.
     """
 
     unit: str = "mm"
@@ -118,11 +118,11 @@ class _PositionDecoder(PdoChannelDecoder):
         return records
 
     def _answered(self, name: str) -> str:
-        """Return the name of flags that the node was asked for."""
+        """Return how events name flags that were read over SDO. `recall` relies on this text."""
         return f"node {self.node}: {name} read over SDO"
 
     def recall(self, event: DeviceEvent) -> bool:
-        carried = {field.index for field in self._flag_fields}  # which the next PDO tells
+        carried = {field.index for field in self._flag_fields}  # the next PDO reports these
         for index, (kind, name, _) in _FLAGS.items():
             is_answer = event.text.startswith(self._answered(name)) and event.code is not None
             if event.kind is kind and is_answer and index not in carried:
@@ -140,18 +140,19 @@ class _PositionDecoder(PdoChannelDecoder):
         return super()._too_short(stamp, data, needed_bits)
 
     def _take_flags(self, stamp: Stamp, index: int, flags: int, name: str, records: list[Record]) -> None:
-        """Report alarms or warnings that have changed."""
+        """Add an event to `records` if the alarms or warnings have changed."""
         if flags != self._flags[index]:
             self._flags[index] = flags
             kind, _, texts = _FLAGS[index]
-            text = f"{name}: {_flag_texts(flags, texts)}" if flags else f"{name} are gone"
+            text = f"{name}: {_flag_texts(flags, texts)}" if flags else f"{name} have cleared"
             records.append(DeviceEvent(self.name, stamp, kind, text, flags))
 
     def decode(self, stamp: Stamp, data: bytes) -> list[Record]:
         """Return the records of one frame.
 
-        A position that no motion explains is an event, and no value, because it is not known which zero it counts from.
-        The samples after it are given as the device gives them: the event says that the joint's zero must be checked.
+        A jump that no motion explains is reported as an event, and its reading has no value, because the zero that the
+        position counts from is unknown. Later samples are returned as the device sends them; the event asks the
+        operator to check the joint's zero.
         """
         if len(data) * 8 < self._needed_bits:
             return self._too_short(stamp, data, self._needed_bits)
@@ -165,7 +166,7 @@ class _PositionDecoder(PdoChannelDecoder):
         if status is not Status.OK:
             if status is Status.MALFORMED:
                 unsigned = self._position.extract(bits)
-                reason = f"{unsigned} and {counts} counts both lie in range_mm: narrow it to the transducer's"
+                reason = f"{unsigned} and {counts} counts are both within range_mm: narrow it to the transducer's range"
                 records.append(DecodeFailure(self.name, stamp, reason, data))
             if self._jumps is not None:
                 self._jumps.bad(stamp)
@@ -180,7 +181,7 @@ class _PositionDecoder(PdoChannelDecoder):
         return records
 
     def _counts(self, bits: int) -> tuple[int, Status]:
-        """Return the position in a PDO, and the status of its value where no alarm voids it."""
+        """Return the position in a PDO, and its status apart from alarms."""
         raise NotImplementedError
 
     def _value(self, counts: int) -> float:
@@ -192,7 +193,7 @@ class EncoderDecoder(_PositionDecoder):
     """Decoder of one `EncoderChannel`.
 
     Raises:
-        DescriptionError: the PDO does not carry 6004h, or the counts per turn or in all are not positive.
+        DescriptionError: the PDO does not contain 6004h, or the counts per revolution or in total are out of range.
     """
 
     def __init__(self, channel: EncoderChannel) -> None:
@@ -207,7 +208,7 @@ class EncoderDecoder(_PositionDecoder):
         self._mask = (1 << self._position.length_bits) - 1
         if total & (total - 1) == 0:
             self._mask &= total - 1
-        # For sign -1 the half-open end changes sides, so that -180 deg is written as for sign +1
+        # For sign -1 the open end of the interval changes sides, so that half a turn is -180 deg as for sign +1
         self._half = total // 2 if channel.sign == 1 else (total - 1) // 2
         self._zero = channel.zero_counts
         self._deg_per_count = channel.sign * 360.0 / channel.units_per_revolution
@@ -224,11 +225,11 @@ class EncoderDecoder(_PositionDecoder):
 class LinearDecoder(_PositionDecoder):
     """Decoder of one `LinearChannel`.
 
-    6020h is signed. 6004h is unsigned by the profile and signed on some transducers: the reading of the two that lies
-    in `range_mm` is taken, and where both do, none.
+    6020h is signed. 6004h is unsigned by the profile but signed on some transducers: of the two interpretations the one
+    within `range_mm` is used; if both are, the reading has no value.
 
     Raises:
-        DescriptionError: the PDO does not carry the position object, or the step is not positive.
+        DescriptionError: the PDO does not contain the position object, or the step is not positive.
     """
 
     def __init__(self, channel: LinearChannel) -> None:

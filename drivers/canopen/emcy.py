@@ -1,4 +1,4 @@
-"""EMCY, the emergency message of a CANopen node (CiA 301): codec, and codes in words."""
+"""EMCY, the emergency message of a CANopen node (CiA 301): decoding, and texts for its codes."""
 
 from __future__ import annotations
 
@@ -46,9 +46,9 @@ class Emergency:
     """An EMCY message.
 
     Attributes:
-        code: emergency error code; 0 when all errors are gone.
-        register: object 1001h.
-        manufacturer: five bytes of the maker's own.
+        code: emergency error code; 0 when all errors have cleared.
+        register: error register, object 1001h.
+        manufacturer: five manufacturer-specific bytes.
     """
 
     code: int
@@ -57,19 +57,19 @@ class Emergency:
 
     @property
     def is_reset(self) -> bool:
-        """True if the node takes errors back (codes 00xxh)."""
+        """True if the node reports that errors have cleared (codes 00xxh)."""
         return self.code & 0xFF00 == 0
 
     @property
     def words(self) -> str:
-        """Code and register as an operator reads them."""
+        """Code and register in words, for messages to operators."""
         text = next((text for mask, code, text in _EMCY_CLASSES if self.code & mask == code), "unknown code")
         bits = error_register_words(self.register)
         return f"emergency {self.code:04X}h ({text}), error register {self.register:02X}h ({bits})"
 
 
 def error_register_words(register: int) -> str:
-    """Return the bits of object 1001h in words; "none" if none is set."""
+    """Return descriptions of the bits set in object 1001h; "none" if none is set."""
     return ", ".join(text for bit, text in _ERROR_REGISTER_BITS.items() if register >> bit & 1) or "none"
 
 
@@ -77,9 +77,9 @@ def decode_emergency(data: bytes) -> Emergency:
     """Decode an EMCY message.
 
     Raises:
-        ValueError: not 8 bytes.
+        ValueError: `data` does not have 8 bytes.
     """
     if len(data) != 8:
-        raise ValueError(f"an EMCY message has 8 bytes, this has {len(data)}")
+        raise ValueError(f"an EMCY message has 8 bytes, this one has {len(data)}")
     code, register = struct.unpack_from("<HB", data)
     return Emergency(code, register, data[3:])

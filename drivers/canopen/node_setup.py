@@ -1,7 +1,7 @@
 """Set-up of CANopen nodes, on request: identify, check, configure, start. A state machine without I/O.
 
-Nothing is written to a node before all that it says of itself fits what the rig file expects. A node that does not fit
-is left as it was found; one that refuses a setting stays pre-operational; the others go on.
+Nothing is written to a node until everything that it reports about itself matches the rig file. A node that does not
+match is left unchanged. A node that refuses a setting stays pre-operational. The set-up of the other nodes continues.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from drivers.errors import DeviceError
 from drivers.readings import DeviceEvent, EventKind
 
 ATTEMPTS = 3
-ANSWER_TIMEOUT_NS = 2 * NS_PER_S  # CiA 301 names none; nodes answer within some 10 ms, except while they store
+ANSWER_TIMEOUT_NS = 2 * NS_PER_S  # CiA 301 defines none; nodes answer within some 10 ms, except while storing settings
 
 PROFILE_ENCODER = 0x0196  # CiA 406 in the low word of object 1000h
 PROFILE_ANALOGUE = 0x0194  # CiA 404
@@ -40,20 +40,20 @@ _SCALING_ON = 1 << 2  # object 6500h
 
 @dataclass(frozen=True, kw_only=True)
 class NodeSetup:
-    """Expected identity and wanted settings of a node. None: not checked.
+    """Expected identity and wanted settings of a node. A value of None is not checked.
 
     Attributes:
         node: CANopen node number.
         name: channel name, for events.
         profile: PROFILE_ENCODER or PROFILE_ANALOGUE.
-        pdo: the TPDO as its decoder expects it.
-        pdo_number: which one, 1 to 4.
+        pdo: the TPDO that the channel's decoder expects.
+        pdo_number: number of that TPDO, 1 to 4.
         mode: `sync` (sampled at every SYNC) or `event_timer` (sent every `period_ms`).
-        period_ms: event timer.
-        heartbeat_ms: heartbeat producer time; 0 leaves the node's own.
-        units_per_revolution, total_units: of a rotary encoder.
-        step_nm: of a linear transducer.
-        decimal_digits: object 6132h of an analogue input with integer values.
+        period_ms: period of the event timer.
+        heartbeat_ms: heartbeat producer time; 0 leaves the node's setting unchanged.
+        units_per_revolution, total_units: expected values of a rotary encoder.
+        step_nm: expected measuring step of a linear transducer.
+        decimal_digits: expected object 6132h of an analogue input with integer values.
     """
 
     node: int
@@ -76,7 +76,7 @@ class NodeSetup:
 
 
 class _MismatchError(DeviceError):
-    """The node is another than expected."""
+    """The node is not the expected one."""
 
 
 _Step = Transfer | NmtCommand
@@ -86,13 +86,14 @@ _Script = Generator[_Step, bytes, str]
 class SetupRunner:
     """Sets up nodes one after the other.
 
-    Feed it what the nodes answer and the time; send the frames of `take_frames`. The events of `take_events` are
-    CONFIGURED, or ALARM for a node that does not fit or does not answer, and WARNING for what could not be verified.
+    The caller feeds the nodes' answers and the time, and sends the frames returned by `take_frames`. The events
+    returned by `take_events` are CONFIGURED, or ALARM for a node that does not match or does not answer, and WARNING
+    for values that could not be verified.
     """
 
     def __init__(self) -> None:
         self._waiting: deque[NodeSetup] = deque()
-        self._setup: NodeSetup | None = None  # of the node that is being set up
+        self._setup: NodeSetup | None = None  # the one in progress
         self._script: _Script
         self._exchange: SdoExchange
         self._warnings: list[str] = []
@@ -103,7 +104,7 @@ class SetupRunner:
 
     @property
     def is_active(self) -> bool:
-        """True while any node is still to be done."""
+        """True while any set-up is in progress or waiting."""
         return self._setup is not None or bool(self._waiting)
 
     @property
@@ -112,11 +113,11 @@ class SetupRunner:
         return None if self._setup is None else self._deadline_ns
 
     def add(self, setup: NodeSetup) -> None:
-        """Put a node behind those that are waiting."""
+        """Add a node to the end of the queue."""
         self._waiting.append(setup)
 
     def feed(self, frame: Frame, now: Stamp) -> None:
-        """Take a received frame."""
+        """Process a received frame."""
         if self._setup is None or not frame.is_plain or frame.arbitration_id != sdo_response_id(self._setup.node):
             return
         exchange = self._exchange
@@ -131,7 +132,7 @@ class SetupRunner:
             self._step(self._setup, exchange.result, now)
 
     def advance(self, now: Stamp) -> None:
-        """Start the next node, or repeat what was not answered in time."""
+        """Start the next node, or repeat a request that was not answered in time."""
         if self._setup is None:
             if self._waiting:
                 self._setup = self._waiting.popleft()
@@ -148,12 +149,12 @@ class SetupRunner:
                 self._step(self._setup, DeviceError(self._setup.where, text), now)
 
     def abort(self, now: Stamp, cause: str) -> None:
-        """Give up all nodes because of `cause`, and say so: nothing is ever taken up again by itself."""
-        given_up = [(setup, "was not begun") for setup in self._waiting]
+        """Cancel all set-ups because of `cause`, with an ALARM for each: they are never resumed automatically."""
+        given_up = [(setup, "was not started") for setup in self._waiting]
         if self._setup is not None:
-            given_up.insert(0, (self._setup, "was cut short and may be half done"))
+            given_up.insert(0, (self._setup, "was interrupted and may be incomplete"))
         for setup, how_far in given_up:
-            text = f"node {setup.node}: set-up {how_far} because {cause}; ask for it again"
+            text = f"node {setup.node}: set-up {how_far} because {cause}; request it again"
             self._events.append(DeviceEvent(setup.name, now, EventKind.ALARM, text))
         self._waiting.clear()
         self._setup = None
@@ -175,7 +176,7 @@ class SetupRunner:
         self._frames.append(Frame(sdo_request_id(setup.node), self._exchange.request))
 
     def _step(self, setup: NodeSetup, outcome: bytes | DeviceError | None, now: Stamp) -> None:
-        """Run the script to its next transfer, or to its end."""
+        """Run the script until its next transfer or its end."""
         try:
             if isinstance(outcome, DeviceError):
                 step = self._script.throw(outcome)
@@ -203,7 +204,7 @@ class SetupRunner:
 
 
 def _script(setup: NodeSetup, warnings: list[str]) -> _Script:
-    """Set up a node: yield transfers and NMT commands, receive the data read, return the result in words."""
+    """Set up a node: yield transfers and NMT commands, receive the data read, and return a text with the result."""
     identity = yield from _identify(setup)
     if setup.profile == PROFILE_ENCODER:
         measuring = yield from _check_position(setup, warnings)
@@ -239,14 +240,14 @@ def _check_position(setup: NodeSetup, warnings: list[str]) -> _Script:
     resolution = yield from _optional(0x6501, 0)
     revolutions = yield from _optional(0x6502, 0)
     for index in (ALARMS, WARNINGS):
-        yield from _optional(index, 0)  # read for the decoder, which sees the answer on the bus
+        yield from _optional(index, 0)  # for the decoder, which receives the answer from the bus
     if setup.step_nm is not None:
         step = yield from _optional(0x6005, 1)
         step = resolution if step is None else step
         _expect(setup, "measuring step in nm (6005h.1, 6501h)", setup.step_nm, step, warnings)
         return f"measuring step {step} nm"
     if status is not None and not status & _SCALING_ON and resolution is not None:
-        # Scaling is off: the device counts its physical steps, whatever 6001h and 6002h say
+        # Scaling is off: the device counts its physical steps and ignores 6001h and 6002h
         units = resolution
         total = None if revolutions is None else resolution * max(revolutions, 1)
         objects = ("6501h, scaling off", "6501h x 6502h, scaling off")
@@ -254,7 +255,7 @@ def _check_position(setup: NodeSetup, warnings: list[str]) -> _Script:
         objects = ("6001h", "6002h")
     _expect(setup, f"units per revolution ({objects[0]})", setup.units_per_revolution, units, warnings)
     _expect(setup, f"total units ({objects[1]})", setup.total_units, total, warnings)
-    return f"{units} units per revolution, {total} in all"
+    return f"{units} units per revolution, {total} in total"
 
 
 def _check_analogue(setup: NodeSetup, warnings: list[str]) -> _Script:
@@ -269,7 +270,7 @@ def _expect(setup: NodeSetup, what: str, expected: int | None, found: int | None
     if expected is None:
         return
     if found is None:
-        warnings.append(f"{what}: the node does not tell; expected {expected}, not verified")
+        warnings.append(f"{what}: the node does not report it; expected {expected}, not verified")
     elif found != expected:
         raise _MismatchError(
             setup.where, f"{what}: expected {expected}, found {found}; correct the rig file or the node"
@@ -289,7 +290,7 @@ def _check_pdo(setup: NodeSetup, warnings: list[str]) -> Generator[_Step, bytes,
         )
     entries = yield from _optional(mapping, 0)
     if entries is None:
-        warnings.append(f"mapping ({mapping:04X}h): the node does not tell, not verified")
+        warnings.append(f"mapping ({mapping:04X}h): the node does not report it; not verified")
         return cob_id
     found: list[int] = []
     while len(found) < min(entries, 64):
@@ -328,7 +329,7 @@ def _configure(setup: NodeSetup, cob_id: int) -> Generator[_Step, bytes, None]:
 
 
 def _optional(index: int, subindex: int) -> Generator[_Step, bytes, int | None]:
-    """Read an unsigned object that a node need not have; None if it does not."""
+    """Read an optional unsigned object; None if the node does not have it."""
     try:
         return _unsigned((yield Upload(index, subindex)))
     except SdoAbortError as error:

@@ -31,11 +31,11 @@ COB_ID_EXTENDED = 1 << 29
 
 @dataclass(frozen=True, slots=True)
 class PdoField:
-    """The place of one object in a PDO. Bits count from the least significant of byte 0 (little endian).
+    """The position of one object in a PDO. Bits count from the least significant bit of byte 0 (little endian).
 
     Attributes:
         index, subindex: the object.
-        first_bit, length_bits: its place.
+        first_bit, length_bits: its position.
     """
 
     index: int
@@ -45,20 +45,20 @@ class PdoField:
 
     @property
     def end_bit(self) -> int:
-        """The first bit behind it: a PDO with fewer bits does not carry it."""
+        """The first bit after the field; a PDO with fewer bits than this does not contain it."""
         return self.first_bit + self.length_bits
 
     @property
     def word(self) -> int:
-        """The mapping entry, as object 1A0xh holds it: index, sub-index, length."""
+        """The mapping entry in the format of object 1A0xh: index, sub-index, length."""
         return self.index << 16 | self.subindex << 8 | self.length_bits
 
     def extract(self, bits: int) -> int:
-        """Return the field as an unsigned integer, from the whole PDO read as a little-endian one."""
+        """Return the field as an unsigned integer; `bits` is the whole PDO as a little-endian integer."""
         return bits >> self.first_bit & ((1 << self.length_bits) - 1)
 
     def extract_signed(self, bits: int) -> int:
-        """Return the field as two's complement."""
+        """Return the field as a signed integer (two's complement)."""
         half = 1 << self.length_bits - 1
         return (self.extract(bits) ^ half) - half
 
@@ -74,7 +74,7 @@ class PdoMapping:
         """Read the 32-bit entries of object 1A0xh, sub-indices 1 and up (`60040020h`: object 6004h.0, 32 bits).
 
         Raises:
-            DescriptionError: no entry, an entry without bits, or more than 64 bits together.
+            DescriptionError: there is no entry, an entry has no bits, or there are more than 64 bits in total.
         """
         fields = []
         first_bit = 0
@@ -87,16 +87,16 @@ class PdoMapping:
         if not fields:
             raise DescriptionError(where, "the PDO mapping has no entries")
         if first_bit > 8 * DATA_MAX:
-            raise DescriptionError(where, f"the PDO mapping has {first_bit} bits, a frame has {8 * DATA_MAX}")
+            raise DescriptionError(where, f"the PDO mapping has {first_bit} bits; a frame has {8 * DATA_MAX}")
         return cls(tuple(fields))
 
     def find(self, index: int) -> PdoField | None:
-        """Return the first field that carries an object, of any sub-index; None if the PDO carries none."""
+        """Return the first field with an object of this index and any sub-index; None if the PDO has none."""
         return next((field for field in self.fields if field.index == index), None)
 
     @property
     def words(self) -> tuple[int, ...]:
-        """The mapping as object 1A0xh holds it."""
+        """The mapping entries in the format of object 1A0xh."""
         return tuple(field.word for field in self.fields)
 
 
@@ -106,7 +106,7 @@ class TransmitPdo:
 
     Attributes:
         arbitration_id, is_extended: its COB-ID.
-        mapping: what it carries.
+        mapping: the objects that it contains.
     """
 
     arbitration_id: int
@@ -125,7 +125,12 @@ class TransmitPdo:
 
     @classmethod
     def from_eds(cls, path: Path, node: int, number: int) -> TransmitPdo:
-        """Read TPDO `number`, counted from 1, of a node from an EDS or DCF.
+        """Read a node's TPDO from an EDS or DCF.
+
+        Args:
+            path: the file.
+            node: CANopen node number.
+            number: number of the TPDO, counted from 1.
 
         Raises:
             DescriptionError: the file is missing or malformed, or has no such TPDO; the message names the object.
@@ -142,7 +147,7 @@ class TransmitPdo:
         return cls(arbitration_id, is_extended, PdoMapping.from_words(words, f"{where}: TPDO{number}"))
 
     def decoding(self, index: int) -> str:
-        """Return in a line where an object is found on the bus, whatever else the PDO carries."""
+        """Return one line that describes where an object is found on the bus, regardless of the PDO's other objects."""
         frame = f"frame {self.arbitration_id:08X}h" if self.is_extended else f"frame {self.arbitration_id:03X}h"
         field = self.mapping.find(index)
         if field is None:
@@ -152,17 +157,17 @@ class TransmitPdo:
 
 @dataclass(frozen=True, kw_only=True)
 class PdoChannel:
-    """Settings that all channels in a node's TPDO share.
+    """Settings common to all channels in a node's TPDO.
 
     Attributes:
-        name: the joint or signal.
+        name: name of the joint or signal.
         unit: unit of the value.
         node: CANopen node number.
-        pdo: the TPDO that carries it.
-        pdo_number: which of the node's TPDOs that is, 1 to 4.
-        is_synchronous: sampled at SYNC, so that its readings carry the instant of the SYNC before.
-        heartbeat_ms: the node's heartbeat producer time; 0: none.
-        timeout_s: silent for longer than this is a gap.
+        pdo: the TPDO that contains the value.
+        pdo_number: number of that TPDO, 1 to 4.
+        is_synchronous: the value is sampled at SYNC, so its readings get the instant of the preceding SYNC.
+        heartbeat_ms: the node's heartbeat producer time; 0 for no heartbeat.
+        timeout_s: silence longer than this is a gap.
     """
 
     name: str
@@ -175,19 +180,19 @@ class PdoChannel:
     timeout_s: float = 1.0
 
     def does_not_carry(self, what: str) -> str:
-        """Return the sentence for a TPDO that lacks the channel's object."""
+        """Return the error text for a TPDO that lacks the channel's object."""
         words = " ".join(f"{word:08X}" for word in self.pdo.mapping.words)
-        return f"TPDO{self.pdo_number} of node {self.node} does not carry {what}; its mapping is {words}"
+        return f"TPDO{self.pdo_number} of node {self.node} does not contain {what}; its mapping is {words}"
 
 
 class PdoChannelDecoder:
     """Base of the decoders of CANopen channels.
 
     Attributes:
-        is_void: the node has an emergency that voids its values (set by the supervision of the node).
+        is_void: the node has an emergency that makes its values invalid (set by the supervision of the node).
     """
 
-    missed_frames: int | None = None  # PDOs carry no counter
+    missed_frames: int | None = None  # PDOs have no counter
 
     def __init__(self, channel: PdoChannel) -> None:
         self.name = channel.name
@@ -201,15 +206,21 @@ class PdoChannelDecoder:
         self._unit = channel.unit
 
     def object_read(self, stamp: Stamp, index: int, value: int) -> list[Record]:  # noqa: ARG002 - profiles use them
-        """Return the records caused by an object of the node that was read over SDO."""
+        """Return the records caused by an object of the node that was read over SDO.
+
+        Args:
+            stamp: when the answer was received.
+            index: index of the object.
+            value: its content as an unsigned integer.
+        """
         return []
 
     def recall(self, event: DeviceEvent) -> bool:  # noqa: ARG002 - profiles use it
-        """Take on alarms or warnings that an earlier decoder of the channel told; True if that changes anything."""
+        """Restore alarms or warnings from an event of an earlier decoder of the channel; True if any were restored."""
         return False
 
     def node_restarted(self) -> None:
-        """Forget the node's last known state, because it has booted."""
+        """Discard the node's last known state, because the node has booted."""
         self.is_void = False
 
     def _too_short(self, stamp: Stamp, data: bytes, needed_bits: int) -> list[Record]:
@@ -218,10 +229,10 @@ class PdoChannelDecoder:
 
 def _import(path: Path, node: int) -> ObjectDictionary:
     try:
-        # EDS files are ASCII by CiA 306; makers write Latin-1 into names
-        # Whatever the file is called: canopen reads XML from one that is called .epf
+        # CiA 306 prescribes ASCII, but some manufacturers use Latin-1 in names
         text = io.StringIO(read_whole(path, _FILE_MAX_BYTES).decode("latin-1"), newline=None).read()
-        # configparser takes time with the square of a run of blanks
+        # Passed as text, because from a file named .epf canopen would read XML. Runs of blanks are shortened, because
+        # the time that configparser takes for one grows with the square of its length
         file = io.StringIO(_BLANKS.sub(" ", text))
         dictionary: ObjectDictionary = import_eds(file, node)  # type: ignore[no-untyped-call]
         return dictionary
@@ -229,7 +240,7 @@ def _import(path: Path, node: int) -> ObjectDictionary:
         raise DescriptionError(str(path), f"cannot be read: {error.strerror}") from error
     except configparser.Error as error:
         raise DescriptionError(str(path), f"not a valid EDS: {' '.join(str(error).split())}") from error
-    # what canopen lets through from its own parsing of numbers, sections and sub-objects
+    # Exceptions that canopen lets escape when it parses numbers, sections and sub-objects
     except (ValueError, KeyError, TypeError, AttributeError, IndexError, ObjectDictionaryError) as error:
         raise DescriptionError(str(path), f"not a valid EDS: {error}") from error
 

@@ -1,6 +1,7 @@
-"""SDO, CANopen's way to an object of a node (CiA 301): codec and client state machine for one transfer at a time.
+"""SDO, CANopen's access to the objects of a node (CiA 301): codec, and client state machine for one transfer.
 
-Uploads (reads) are expedited or segmented, downloads (writes) expedited: no object that rigcal writes has over 4 bytes.
+Uploads (reads) are expedited or segmented. Downloads (writes) are expedited only, as no object that rigcal writes has
+more than 4 bytes.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from dataclasses import dataclass
 
 from drivers.errors import DeviceError
 
-UPLOAD_MAX_BYTES = 4096  # no object that is read here comes near; a node that never ends must not fill memory
+UPLOAD_MAX_BYTES = 4096  # far more than any object read here has; limits memory if a node never ends
 
 NO_SUCH_OBJECT = 0x06020000
 NO_SUCH_SUBINDEX = 0x06090011
@@ -31,7 +32,7 @@ ABORT_TEXTS = {
     0x06040042: "mapped objects would exceed the PDO length",
     0x06040043: "general parameter incompatibility",
     0x06040047: "general internal incompatibility in the device",
-    0x06060000: "access failed for a hardware error",
+    0x06060000: "access failed because of a hardware error",
     0x06070010: "data type or length does not match",
     0x06070012: "data too long",
     0x06070013: "data too short",
@@ -91,7 +92,7 @@ class SdoAbortError(DeviceError):
 
 @dataclass(frozen=True, slots=True)
 class UploadResponse:
-    """Answer to the start of an upload: the data itself if it was expedited, else None (segments follow)."""
+    """Answer to an upload request: the data if the upload is expedited, else None (segments follow)."""
 
     index: int
     subindex: int
@@ -128,20 +129,20 @@ Response = UploadResponse | SegmentResponse | DownloadResponse | AbortResponse
 
 
 def encode_upload(index: int, subindex: int) -> bytes:
-    """Request to read an object."""
+    """Encode the request to read an object."""
     return struct.pack("<BHB4x", 0x40, index, subindex)
 
 
 def encode_upload_segment(toggle: int) -> bytes:
-    """Request for the next segment of an upload."""
+    """Encode the request for the next segment of an upload."""
     return bytes((0x60 | toggle << 4,)) + bytes(7)
 
 
 def encode_download(index: int, subindex: int, data: bytes) -> bytes:
-    """Request to write 1 to 4 bytes, expedited, with the size said.
+    """Encode the request to write 1 to 4 bytes, expedited and with the size indicated.
 
     Raises:
-        ValueError: no data or more than 4 bytes.
+        ValueError: `data` is empty or has more than 4 bytes.
     """
     if not 1 <= len(data) <= 4:
         raise ValueError(f"an expedited download has 1 to 4 bytes, not {len(data)}")
@@ -149,13 +150,13 @@ def encode_download(index: int, subindex: int, data: bytes) -> bytes:
 
 
 def decode_response(data: bytes) -> Response:
-    """A server's message.
+    """Decode a server's message.
 
     Raises:
-        ValueError: not 8 bytes, or a command specifier that no transfer of this module causes.
+        ValueError: not 8 bytes, or a command specifier that does not belong to the transfers of this module.
     """
     if len(data) != 8:
-        raise ValueError(f"an SDO message has 8 bytes, this has {len(data)}")
+        raise ValueError(f"an SDO message has 8 bytes, this one has {len(data)}")
     command, index, subindex = struct.unpack_from("<BHB", data)
     specifier = command >> 5
     if specifier == 0:
@@ -163,25 +164,25 @@ def decode_response(data: bytes) -> Response:
     if specifier == 2:
         if not command & 2:
             return UploadResponse(index, subindex, None)
-        unused = command >> 2 & 3 if command & 1 else 0  # 42h: the size is not said, all four bytes are given
+        unused = command >> 2 & 3 if command & 1 else 0  # 42h: no size indicated, all four bytes are data
         return UploadResponse(index, subindex, data[4 : 8 - unused])
     if specifier == 3:
         return DownloadResponse(index, subindex)
     if specifier == 4:
         return AbortResponse(index, subindex, int.from_bytes(data[4:], "little"))
-    raise ValueError(f"SDO command {command:02X}h answers no upload and no expedited download")
+    raise ValueError(f"SDO command {command:02X}h is not an answer to an upload or an expedited download")
 
 
 class SdoExchange:
-    """The client's side of one transfer: send `request` to the node, `feed` what it answers until `result` is set.
+    """The client side of one transfer: send `request` to the node and `feed` its answers until `result` is set.
 
     Args:
-        where: the node, for messages.
-        transfer: what to read or write.
+        where: name of the node, for error messages.
+        transfer: the object to read or write.
 
     Attributes:
-        request: what to send next, or again after a time-out; bytes of the request COB-ID.
-        result: bytes read (empty for a download) once the transfer is complete.
+        request: data of the frame to send next, or again after a timeout, with the node's SDO request COB-ID.
+        result: bytes read (empty for a download) once the transfer is complete, else None.
     """
 
     def __init__(self, where: str, transfer: Transfer) -> None:
@@ -196,12 +197,12 @@ class SdoExchange:
             self.request = encode_download(transfer.index, transfer.subindex, transfer.data)
 
     def feed(self, data: bytes) -> bool:
-        """Take a message of the node's; True when `request` is a new one that must be sent.
+        """Process a message from the node; return True if there is a new `request` to send.
 
-        Messages that answer something else (another client's transfer, a late repetition) are passed over.
+        Messages that do not belong to this transfer (another client's transfer, a late repetition) are ignored.
 
         Raises:
-            SdoAbortError: the node refused.
+            SdoAbortError: the node refused the transfer.
             DeviceError: the node sends more than UPLOAD_MAX_BYTES.
         """
         try:
@@ -225,7 +226,7 @@ class SdoExchange:
             self.result = response.data
             return False
         if self._segments is not None:
-            return False  # an answer to a repeated request: the segments are already being fetched
+            return False  # answer to a repeated request; the segments are already being read
         self._segments = bytearray()
         self.request = encode_upload_segment(0)
         return True
@@ -235,7 +236,7 @@ class SdoExchange:
             return False
         self._segments += segment.data
         if len(self._segments) > UPLOAD_MAX_BYTES:
-            raise DeviceError(self._where, f"{self.transfer}: more than {UPLOAD_MAX_BYTES} bytes, given up")
+            raise DeviceError(self._where, f"{self.transfer}: cancelled after more than {UPLOAD_MAX_BYTES} bytes")
         if segment.is_last:
             self.result = bytes(self._segments)
             return False

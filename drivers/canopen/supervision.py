@@ -1,4 +1,4 @@
-"""Supervision of a CANopen node by its frames: boot-up, state, heartbeat, emergencies, objects read."""
+"""Supervision of a CANopen node from its frames: boot-up, state, heartbeat, emergencies, objects read over SDO."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from drivers.canopen.sdo import UploadResponse, decode_response
 from drivers.clock import NS_PER_S, Stamp
 from drivers.readings import DecodeFailure, DeviceEvent, EventKind, Record
 
-HEARTBEAT_TOLERANCE = 2.5  # producer times without a heartbeat: two may be lost, and the node's clock be slow
+HEARTBEAT_TOLERANCE = 2.5  # producer times; allows for two lost heartbeats and a slow clock of the node
 
 VOIDS = "its values are not used until it takes this back"
-"""How the text of an emergency ends while it, or one before it, voids the values of the node's channels."""
+"""End of an emergency's text while this or an earlier emergency makes the node's values invalid; `recall` needs it."""
 
 _REGISTER_DEVICE_PROFILE = 1 << 5
 _CLASS_HARDWARE = 0x5000
@@ -24,18 +24,18 @@ _CLASS_HARDWARE = 0x5000
 class NodeSupervision:
     """Supervision of one node.
 
-    The heartbeat is supervised from the first that is heard after a boot-up (CiA 301), for a node that has booted may
-    not produce any until it is configured; one that never does is noticed by the silence of its channels.
+    The heartbeat is supervised from the first one received after a boot-up (CiA 301), because a node that has booted
+    may not send any until it is configured. A node that never sends one is noticed by the silence of its channels.
 
-    An emergency voids the values of the node's channels if it says that the measurement itself has failed: code 5xxxh
-    (device hardware), or error register bit 5 (device profile). Any other, such as communication, voltage or
-    temperature, is reported and leaves the values, which 6503h voids where they are wrong. A code 00xxh with an error
-    register of zero, or a boot-up, makes them valid again; with a bit of the register left, one error of several is
-    gone, and which one is not said (CiA 301, emergency state transitions).
+    An emergency makes the values of the node's channels invalid if it reports that the measurement itself has failed:
+    code 5xxxh (device hardware), or error register bit 5 (device profile). Other emergencies, such as communication,
+    voltage or temperature, are reported and leave the values valid; if the values are wrong, 6503h marks them. A code
+    00xxh with an error register of zero, or a boot-up, makes the values valid again. A code 00xxh with bits left in the
+    register means that one of several errors has cleared, but not which one (CiA 301, emergency state transitions).
 
     Args:
         node: node number.
-        channels: decoders of the channels that the node feeds, at least one; the first names the node in events.
+        channels: decoders of the channels that the node feeds, at least one; events use the first one's name.
     """
 
     def __init__(self, node: int, channels: Sequence[PdoChannelDecoder]) -> None:
@@ -57,13 +57,13 @@ class NodeSupervision:
         }
 
     def recall(self, event: DeviceEvent) -> list[DeviceEvent]:
-        """Take on what an event told that an earlier decoder made of this node, as its text says.
+        """Restore the node's state from an event of an earlier decoder if its text names this node.
 
         Args:
-            event: of a channel of the link; with another rig file the node may have been another channel's.
+            event: event of a channel of the link; the node may have fed a different channel in an earlier rig file.
 
         Returns:
-            The event under the name that the node has now; nothing where it is another node's, or tells nothing.
+            The event under the node's current name; empty if it is about a different node or changes nothing.
         """
         if not event.text.startswith((f"node {self.node}:", f"node {self.node} ")):
             return []
@@ -83,13 +83,13 @@ class NodeSupervision:
         return [replace(event, device=self._name)]
 
     def tick(self, now: Stamp) -> list[Record]:
-        """Report a heartbeat that is overdue."""
+        """Return the event of an overdue heartbeat, once."""
         heartbeat = self._heartbeat
         if heartbeat is None or self._is_lost or not self._timeout_ns or now.since(heartbeat) <= self._timeout_ns:
             return []
         self._is_lost = True
         text = f"node {self.node}: no heartbeat for {self._timeout_ns / NS_PER_S:g} s; check its power and cable"
-        # Stamped with the deadline, so that it does not matter when this is called
+        # Timestamped with the deadline, so that the time of the call does not matter
         return [DeviceEvent(self._name, heartbeat.shifted(self._timeout_ns), EventKind.HEARTBEAT_LOST, text)]
 
     def _on_heartbeat(self, stamp: Stamp, data: bytes) -> list[Record]:
@@ -104,7 +104,7 @@ class NodeSupervision:
             text = f"node {self.node}: heartbeat is back, state {state.words}"
             records.append(DeviceEvent(self._name, stamp, EventKind.HEARTBEAT_RESTORED, text))
         if state is NmtState.BOOT_UP:
-            text = f"node {self.node} has booted; it sends nothing until it is started"
+            text = f"node {self.node} has booted; it sends no values until it is started"
             records.append(DeviceEvent(self._name, stamp, EventKind.BOOT_UP, text))
             for channel in self._channels:
                 channel.node_restarted()
@@ -122,13 +122,13 @@ class NodeSupervision:
             return [DecodeFailure(self._name, stamp, f"node {self.node}: {error}", data)]
         if emergency.is_reset and not emergency.register:
             self._void(is_void=False)
-            text = f"node {self.node}: errors are gone ({emergency.words})"
+            text = f"node {self.node}: all errors have cleared ({emergency.words})"
             return [DeviceEvent(self._name, stamp, EventKind.EMERGENCY_CLEARED, text, emergency.code)]
         is_void = emergency.code & 0xF000 == _CLASS_HARDWARE or bool(emergency.register & _REGISTER_DEVICE_PROFILE)
-        # Another emergency does not make values valid that one before it has voided.
+        # A later emergency does not make values valid again that an earlier one made invalid
         is_void |= any(channel.is_void for channel in self._channels)
         self._void(is_void=is_void)
-        what = f"an error is gone, others are left: {emergency.words}" if emergency.is_reset else emergency.words
+        what = f"one error has cleared, others remain: {emergency.words}" if emergency.is_reset else emergency.words
         text = f"node {self.node}: {what}{f'; {VOIDS}' if is_void else ''}"
         return [DeviceEvent(self._name, stamp, EventKind.EMERGENCY, text, emergency.code or None)]
 
@@ -137,11 +137,11 @@ class NodeSupervision:
             channel.is_void = is_void
 
     def _on_sdo_response(self, stamp: Stamp, data: bytes) -> list[Record]:
-        """Take the value of an object of the node that anybody on the bus has read."""
+        """Process the value of an object that any client on the bus has read from the node."""
         try:
             response = decode_response(data)
         except ValueError:
-            return []  # of block transfers and others; no reading depends on it
+            return []  # block transfer or similar; no reading depends on it
         if not isinstance(response, UploadResponse) or response.data is None:
             return []
         value = int.from_bytes(response.data, "little")

@@ -1,4 +1,4 @@
-"""SYNC (CiA 301): when it is due, and which PDOs it sampled."""
+"""SYNC (CiA 301): when to send it, and which PDOs were sampled at it."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ from drivers.clock import NS_PER_S, Stamp
 
 SYNC_ID = 0x080
 SYNC_WINDOW_NS = NS_PER_S // 10
-"""A PDO that follows a SYNC by more was not sampled by it: ten nodes at 20 kbit/s need 60 ms."""
+"""Longest time from a SYNC to a PDO sampled at it; ten nodes at 20 kbit/s need 60 ms."""
 
 
 class SyncProducer:
     """Sends SYNC on a fixed monotonic grid, without drift and without bursts after a stall.
 
     Args:
-        period_ns: of the grid.
-        start_ns: its first instant, monotonic.
+        period_ns: period of the grid.
+        start_ns: first instant of the grid, monotonic.
 
     Attributes:
         next_ns: the next instant at which SYNC is due.
@@ -34,7 +34,7 @@ class SyncProducer:
 
 
 class SyncSampling:
-    """Finds the instants at which a synchronous channel was sampled: the first PDO after a SYNC was, at that SYNC."""
+    """Finds when a synchronous channel was sampled: the first PDO after a SYNC was sampled at that SYNC."""
 
     def __init__(self) -> None:
         self._used: Stamp | None = None
@@ -44,7 +44,7 @@ class SyncSampling:
 
         Args:
             stamp: when the PDO was received.
-            sync: when the last SYNC was sent or received.
+            sync: when the last SYNC was sent or received; None if there was none.
         """
         if sync is None or sync is self._used:
             return stamp

@@ -1,4 +1,4 @@
-"""Permission to send on a machine's bus: none, unless the configuration gives it, node by node."""
+"""Permission to send on a machine's bus: denied unless the configuration allows it, node by node."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _TO_NODE = (Service.SDO_REQUEST, Service.RPDO)
 
 
 def is_free(arbitration_id: int) -> bool:
-    """Return True if CANopen leaves an 11-bit identifier free for messages of one's own.
+    """Return True if CANopen leaves an 11-bit identifier free for an application's own messages.
 
     Source: CiA 301, the pre-defined connection set and the table of restricted CAN-IDs.
     """
@@ -22,20 +22,20 @@ def is_free(arbitration_id: int) -> bool:
 
 
 class TransmitPermission:
-    """The gate in front of a link's sender.
+    """Checks every frame before a link sends it.
 
-    SYNC and TIME need `allow_transmit`; NMT, SDO requests and RPDOs also need their node to be listed, and rigcal's own
-    messages their identifier. Everything else is refused always: NMT to all nodes, LSS, remote and extended frames, and
-    what only a node itself may send.
+    SYNC and TIME need `allow_transmit`. NMT, SDO requests and RPDOs also need their node to be listed, and rigcal's own
+    messages need their identifier to be listed. Everything else is always refused: NMT to all nodes, LSS, remote and
+    extended frames, and messages that only a node itself may send.
 
     Args:
-        link: name of the link, for messages.
-        allow_transmit: whether anything may be sent at all.
-        nodes: nodes that may be addressed.
+        link: name of the link, for error messages.
+        allow_transmit: the link may send.
+        nodes: numbers of the nodes that may be addressed.
         own_identifiers: 11-bit identifiers of rigcal's own messages.
 
     Raises:
-        TransmitForbiddenError: an own identifier is asked for on a link that may not transmit, or is CANopen's.
+        TransmitForbiddenError: an own identifier is given for a link that may not transmit, or belongs to CANopen.
     """
 
     def __init__(
@@ -49,7 +49,7 @@ class TransmitPermission:
             self.check_link()
             if not is_free(identifier):
                 raise TransmitForbiddenError(
-                    link, f"identifier {identifier:03X}h is not free for own messages (680h to 6DFh are)"
+                    link, f"identifier {identifier:03X}h is not free for rigcal's messages; use one of 680h to 6DFh"
                 )
 
     def check_link(self) -> None:
@@ -81,4 +81,4 @@ class TransmitPermission:
             if meaning.service is Service.NMT and len(frame.data) == 2 and frame.data[1] != 0:
                 self.check_node(frame.data[1])
                 return
-        raise TransmitForbiddenError(self._link, f"frame {frame} is none that rigcal may ever send")
+        raise TransmitForbiddenError(self._link, f"frame {frame} is of a kind that rigcal never sends")

@@ -1,10 +1,11 @@
-"""Vector's text CAN log (`.asc`): a header, then frames among lines that tell what else went on.
+"""Vector's text CAN log (`.asc`): a header, then frames mixed with lines about other events.
 
-Own reader, because python-can's passes over every line that it does not know, also a damaged one or one cut short, and
-takes 1970 and hexadecimal numbers where the header is missing. Here a line is a frame, known to be none, or refused.
+This module has its own reader because python-can's silently skips every line that it does not know, including damaged
+or truncated ones, and assumes 1970 and hexadecimal numbers if the header is missing. Here each line is a frame, a known
+line of another kind, or an error.
 
     date Fri Nov 27 11:48:03.730 am 2026               local time of second 0
-    base hex  timestamps absolute                      of identifiers, lengths and data
+    base hex  timestamps absolute                      number base of identifiers, lengths and data
     Begin Triggerblock Fri Nov 27 11:51:33.000 2026    local time of second 0 from here on
        0.057767 1  1BC             Rx   d 2 0B 05      second, channel, identifier (with x: 29 bits), direction, data
        0.104574 2  730x            Tx   r
@@ -52,23 +53,23 @@ _EVENT = re.compile(
     r"|CAN(?:FD)?\s+\d{1,3}\s+(?:Status:|Statistic:|OverloadFrame\b).*"
     r"|(?:Li|L\d+|LIN|Fr|ETH|AFDX|WLAN|MOST|M\d+)\s.*"  # other buses
     r"|(?:CAN|LIN|FlexRay)\s+\d{1,3}\s+\S+\s=\s.*|\S+\s:=.*|SV:.*"  # signals and variables
-    r"|GPS\s.*|TFS:.*|.*\bGMGroup:.*",  # places, steps of tests, marks
+    r"|GPS\s.*|TFS:.*|.*\bGMGroup:.*",  # positions, test steps, markers
     re.ASCII | re.IGNORECASE,
 )
 _DIGITS = {16: re.compile(r"[0-9A-F]+", re.IGNORECASE), 10: re.compile(r"[0-9]+")}
 _BYTES = {16: re.compile(r"[0-9A-F]{2}", re.IGNORECASE), 10: re.compile(r"[01]?[0-9]?[0-9]|2[0-4][0-9]|25[0-5]")}
 _BASE_NAMES = {16: "hexadecimal", 10: "decimal"}
-_LONGEST_CODE = 15  # of a length; classic frames with codes above 8 have 8 bytes
+_LONGEST_CODE = 15  # largest length code; classic frames with codes above 8 have 8 bytes
 
 
 class AscReader:
-    """The frames of a log, as python-can's messages.
+    """Reader of a log; iterate over it to get the frames as python-can messages.
 
     Args:
-        lines: of the file, with their ends.
+        lines: lines of the file, including line ends.
 
     Attributes:
-        line: number of the line that was read last.
+        line: number of the line read last.
     """
 
     def __init__(self, lines: Iterable[str]) -> None:
@@ -78,7 +79,7 @@ class AscReader:
         self._start_s: float | None = None
 
     def __iter__(self) -> Iterator[can.Message]:
-        """The frames in order; ValueError says what is wrong with the line `line`, frames before it have been given."""
+        """Yield the frames in order; raise ValueError at the first invalid line, whose number is `line`."""
         for text in self._lines:
             self.line += 1
             line = text.strip()
@@ -90,13 +91,13 @@ class AscReader:
                 raise _unknown(line)
 
     def _is_header(self, line: str) -> bool:
-        """Take what a line says of all those after it."""
+        """Process a header line, which applies to all lines after it; return False if it is not one."""
         if date := _DATE.fullmatch(line) or _BEGIN.fullmatch(line):
             if date["date"] is not None:
                 self._start_s = _local_time_s(date["date"])
         elif base := _BASE.fullmatch(line):
             if (base["timestamps"] or "").lower() == "relative":
-                raise ValueError("times that count from the line before are not read: save the log with absolute ones")
+                raise ValueError("relative timestamps are not supported; save the log with absolute timestamps")
             self._base = 16 if base["base"].lower() == "hex" else 10
         else:
             return False
@@ -115,11 +116,11 @@ class AscReader:
         base = self._base
         if base is None:
             raise ValueError(
-                "a frame without a line 'base hex' or 'base dec' before it: whether its numbers are hexadecimal is not "
-                "known; the file's beginning is missing"
+                "there is no line 'base hex' or 'base dec' before this frame, so the base of its numbers is unknown; "
+                "restore the missing beginning of the file"
             )
         if base == 10 and not is_ended:
-            raise ValueError(f"the last line has no end, its last number may be cut short: {line[:80]!r}")
+            raise ValueError(f"the last line has no line end, so its last number may be truncated: {line[:80]!r}")
         data, length = b"", 0
         if match["remote"] is None:
             data, length = _data(match["length"], match["data"] or "", base, line)
@@ -137,39 +138,39 @@ class AscReader:
     def _utc_s(self, seconds: float) -> float:
         if self._start_s is None:
             raise ValueError(
-                "a frame without a line 'date ...' or 'Begin Triggerblock ...' before it: when it was is not known; "
-                "the file's beginning is missing"
+                "there is no line 'date ...' or 'Begin Triggerblock ...' before this frame, so its time is unknown; "
+                "restore the missing beginning of the file"
             )
         return self._start_s + seconds
 
 
 def _data(code: str, text: str, base: int, line: str) -> tuple[bytes, int]:
-    """Bytes of a frame, and how many its length code says; other words may follow the bytes."""
+    """Return a frame's bytes and the length from its length code; other words may follow the bytes."""
     length = _number(code, "length", base, line)
     if length > _LONGEST_CODE:
-        raise ValueError(f"a frame has no length {code}: {line[:80]!r}")
+        raise ValueError(f"{code} is not a valid frame length: {line[:80]!r}")
     length = min(length, DATA_MAX)
     numbers = [int(word, base) for word in takewhile(_BYTES[base].fullmatch, text.split())]
     if len(numbers) != length:
-        raise ValueError(f"the frame says {length} bytes and has {len(numbers)}: {line[:80]!r}")
+        raise ValueError(f"the frame has {len(numbers)} bytes, but its length is given as {length}: {line[:80]!r}")
     return bytes(numbers), length
 
 
 def _number(word: str, what: str, base: int, line: str) -> int:
     if _DIGITS[base].fullmatch(word) is None:
-        raise ValueError(f"{what} {word!r} is no {_BASE_NAMES[base]} number: {line[:80]!r}")
+        raise ValueError(f"{what} {word!r} is not a {_BASE_NAMES[base]} number: {line[:80]!r}")
     return int(word, base)
 
 
 def _unknown(line: str) -> ValueError:
     return ValueError(
-        f"not a line of an ASC log such as {_EXAMPLE}: {line[:80]!r}; it is damaged, cut short, or of a kind that is "
-        "not known here: take it out to have the others read"
+        f"not a line of an ASC log such as {_EXAMPLE}: {line[:80]!r}; it is damaged, truncated or of an unknown kind: "
+        "remove it to read the other lines"
     )
 
 
 def _local_time_s(text: str) -> float:
-    """UTC of a local time, whatever the language of the computer that reads it."""
+    """Return UTC in seconds of a local time, independent of this computer's language setting."""
     match = _INSTANT.fullmatch(text.strip())
     try:
         if match is None:

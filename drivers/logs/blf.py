@@ -1,12 +1,13 @@
 """Vector's binary CAN log (`.blf`): a header and objects, most of them in compressed containers.
 
-Own reader, because python-can's follows whatever an object says of its size: a size of 0 is read for ever, and a
-container unpacks to any size. Here an object is never larger than OBJECT_MAX, and a size that leads nowhere is refused.
+This module has its own reader because python-can's trusts the size that an object declares: it reads a size of 0
+forever, and unpacks a container to any size. Here an object is never larger than OBJECT_MAX, and an invalid size is an
+error.
 
     file      = header ("LOGG", ...), objects
     object    = "LOBJ", header size u16, header version u16, object size u32, type u32, [flags, time, ...], body
-    container = object of type 10: method u16 (0 plain, 2 zlib), ..., bytes of further objects, which may go on in the
-                next container
+    container = object of type 10: method u16 (0 plain, 2 zlib), ..., bytes of further objects, which may continue in
+                the next container
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ import can
 from can.util import dlc2len
 
 OBJECT_MAX = 4 << 20  # bytes of an object; Vector's containers hold 128 KiB
-UNPACKED_MAX = 500  # times the size of what is packed; frames with their times shrink to a tenth
+UNPACKED_MAX = 500  # largest ratio of unpacked to packed size; for frames with their times the ratio is about 10
 
 _FILE_HEADER = struct.Struct("<4sL8xQQLL8H8H")
 _OBJECT = struct.Struct("<4sHHLL")
@@ -41,18 +42,18 @@ _EXTENDED, _IDENTIFIER = 0x80000000, 0x1FFFFFFF
 
 
 class BlfReader:
-    """The frames of a log, as python-can's messages.
+    """Reader of a log; iterate over it to get the frames as python-can messages.
 
-    Objects that are no frame, error frames of other types than CAN_ERROR_EXT among them, are passed over.
+    Objects that are not frames, and error frames of other types than CAN_ERROR_EXT, are skipped.
 
     Args:
-        file: open for reading, at its beginning.
+        file: file opened for reading, positioned at its beginning.
 
     Attributes:
-        file_size, object_count: what the header says of the file; 0 in one that was not closed.
+        file_size, object_count: values from the file's header; 0 if the file was not closed.
 
     Raises:
-        ValueError: the file does not begin as a log does.
+        ValueError: the file does not begin like a BLF log.
     """
 
     def __init__(self, file: BinaryIO) -> None:
@@ -63,19 +64,19 @@ class BlfReader:
         _, header_size, self.file_size, _, self.object_count, _, *times = _FILE_HEADER.unpack(data)
         self._start_s = _seconds(times[:8])
         if not _FILE_HEADER.size <= header_size <= OBJECT_MAX:
-            raise ValueError(f"its header says that it has {header_size} bytes")
+            raise ValueError(f"its header has an invalid size: {header_size} bytes")
         self._at = header_size
         file.seek(header_size)
 
     def __iter__(self) -> Iterator[can.Message]:
-        """The frames in order; ValueError says where the file makes no sense, frames before it have been given."""
+        """Yield the frames in order; raise ValueError, with the position, at the first invalid object."""
         packed = _Packed()
         while head := self._file.read(_OBJECT.size):
             where = f"object at byte {self._at}"
             size, kind = _size_and_kind(head, where)
             body = self._file.read(size - _OBJECT.size)
             if len(body) < size - _OBJECT.size:
-                raise ValueError(f"{where} has {size} bytes, the file ends before")
+                raise ValueError(f"{where} has {size} bytes, but the file ends before that")
             self._file.read(size % 4)  # padding
             self._at += size + size % 4
             if kind == _CONTAINER_TYPE:
@@ -97,15 +98,15 @@ class BlfReader:
         if kind not in _BODIES:
             return None
         if self._start_s is None:
-            raise ValueError("its header has no valid date: when its frames were is not known")
+            raise ValueError("its header has no valid date, so the times of its frames are unknown")
         stamped = _STAMPED.get(version)
         if stamped is None:
-            raise ValueError(f"{where}: a frame with a header of version {version}, which is not known")
+            raise ValueError(f"{where}: a frame has a header of unknown version {version}")
         try:
             flags, ticks = stamped.unpack_from(data, _OBJECT.size)
             parts = _BODIES[kind](data, _OBJECT.size + stamped.size)
         except struct.error as error:
-            raise ValueError(f"{where}: a frame is cut short: {error}") from error
+            raise ValueError(f"{where}: a frame is truncated: {error}") from error
         seconds = ticks * (1e-5 if flags == _TEN_MICROSECONDS else 1e-9)
         return can.Message(
             timestamp=seconds + self._start_s,
@@ -122,7 +123,7 @@ class BlfReader:
 
 
 class _Packed:
-    """Contents of the containers, joined and split into objects: one may begin in a container and end in the next."""
+    """Contents of the containers, joined and split into objects; an object may begin in one and end in the next."""
 
     def __init__(self) -> None:
         self._buffer = bytearray()
@@ -134,13 +135,13 @@ class _Packed:
         self._buffer += data
 
     def take(self, where: str) -> bytes | None:
-        """The next object; None if the rest of it is still to come."""
+        """Return the next object; None if it is not complete yet."""
         buffer, at = self._buffer, self._at
         if len(buffer) - at < 8:
             return None
-        at = buffer.find(_SIGNATURE, at, at + 8)  # behind up to four bytes of padding
+        at = buffer.find(_SIGNATURE, at, at + 8)  # after up to four bytes of padding
         if at < 0:
-            raise ValueError(f"{where}: no object where one should begin")
+            raise ValueError(f"{where}: no object found where one should begin")
         if len(buffer) - at < _OBJECT.size:
             return None
         size, _ = _size_and_kind(bytes(buffer[at : at + _OBJECT.size]), where)
@@ -151,7 +152,7 @@ class _Packed:
 
 
 class _Body(NamedTuple):
-    """Fields of an object that is a frame."""
+    """Fields of a frame object."""
 
     channel: int
     identifier: int
@@ -189,7 +190,7 @@ def _fd(data: bytes, at: int) -> _Body:
 
 def _fd_64(data: bytes, at: int) -> _Body:
     channel, code, count, _, identifier, _, flags, *_, direction, further, _ = _FD_64.unpack_from(data, at)
-    # What does not fit before the further data counts as zeros, as in Vector's own reader
+    # Bytes missing before the extra data count as zeros, as in Vector's own reader
     content = data[at + _FD_64.size : further or None][:count].ljust(count, b"\0")
     return _Body(
         channel,
@@ -208,34 +209,34 @@ _BODIES = {1: _classic, 73: _error, 86: _classic, 100: _fd, 101: _fd_64}
 
 def _size_and_kind(head: bytes, where: str) -> tuple[int, int]:
     if len(head) < _OBJECT.size or head[:4] != _SIGNATURE:
-        raise ValueError(f"{where}: no object where one should begin")
+        raise ValueError(f"{where}: no object found where one should begin")
     _, _, _, size, kind = _OBJECT.unpack(head)
     if not _OBJECT.size <= size <= OBJECT_MAX:
-        raise ValueError(f"{where}: an object of {size} bytes; possible are {_OBJECT.size} to {OBJECT_MAX}")
+        raise ValueError(f"{where}: an object has {size} bytes; allowed are {_OBJECT.size} to {OBJECT_MAX}")
     return size, kind
 
 
 def _unpacked(body: bytes, where: str) -> bytes:
     if len(body) < _CONTAINER.size:
-        raise ValueError(f"{where}: a container without a header")
+        raise ValueError(f"{where}: a container has no header")
     method, _ = _CONTAINER.unpack_from(body)
     packed = body[_CONTAINER.size :]
     if method == _PLAIN:
         return packed
     if method != _ZLIB:
-        raise ValueError(f"{where}: compressed by method {method}; 0 and 2 are known")
+        raise ValueError(f"{where}: unknown compression method {method}; supported are 0 and 2")
     most = min(OBJECT_MAX, UNPACKED_MAX * len(packed))
     inflater = zlib.decompressobj()
     data = inflater.decompress(packed, most)
     if inflater.unconsumed_tail and inflater.decompress(inflater.unconsumed_tail, 1):
         raise ValueError(f"{where}: {len(packed)} bytes unpack to more than {most}")
     if not inflater.eof:
-        raise ValueError(f"{where}: what is packed in it is cut short")
+        raise ValueError(f"{where}: its compressed data is truncated")
     return data
 
 
 def _seconds(time: list[int]) -> float | None:
-    """UTC of a SYSTEMTIME (year, month, day of the week, day, hour, minute, second, ms); None where it is none."""
+    """Return UTC of a SYSTEMTIME (year, month, weekday, day, hour, minute, second, ms); None if it is invalid."""
     year, month, _, day, hour, minute, second, millisecond = time
     try:
         stamp = datetime.datetime(year, month, day, hour, minute, second, millisecond * 1000, tzinfo=datetime.UTC)

@@ -1,15 +1,15 @@
 """Captured CAN logs: candump `.log`, Vector `.asc` and `.blf`, read and written.
 
-What the formats keep:
+The formats do not keep everything:
 
-* candump: everything but which boot a frame belongs to; instants to the microsecond. Own reader and writer, because
-  python-can's turn an error frame into an empty one, or, for most error classes, into a data frame that never was.
-* `.blf`: everything but link names (channel numbers instead) and which error frames were sent. Own reader
+* candump: loses the boot that a frame belongs to; instants are kept to the microsecond. Own reader and writer, because
+  python-can's turn an error frame into an empty one or, for most error classes, into a data frame that never existed.
+* `.blf`: loses link names (channel numbers are kept instead) and which error frames were sent. Own reader
   (`drivers.logs.blf`), because python-can's never ends on some damaged files.
-* `.asc`: no link names, error frames without class and data, and the local time of where it was written. Own reader
-  (`drivers.logs.asc`), because python-can's passes over damaged lines; its writer.
+* `.asc`: loses link names, and class and data of error frames; times are local times of the computer that wrote the
+  file. Own reader (`drivers.logs.asc`), because python-can's skips damaged lines; python-can's writer is used.
 
-A remote frame's length is kept by none, because a capture has none. CAN FD frames are refused.
+No format keeps a remote frame's length, because a capture has none. CAN FD frames are refused.
 """
 
 from __future__ import annotations
@@ -45,15 +45,16 @@ _CANDUMP = re.compile(
 def read_can_log(path: Path, link: str | None = None) -> Iterator[CanCapture]:
     """Read a log, frame by frame.
 
-    Stamps carry the log's time as UTC and as monotonic time, and the boot "log".
+    Stamps have the log's time both as UTC and as monotonic time, and the boot "log".
 
     Args:
         path: the file; its suffix is one of FORMATS.
-        link: name for all frames; None: the log's own channel name (`.asc`, `.blf`: `can0` for the first channel, ...).
+        link: link name for all frames; None for the log's own channel names (`can0` for the first channel of an `.asc`
+            or `.blf`).
 
     Raises:
         DescriptionError: not one of FORMATS, cannot be read, or malformed; the message gives the line, or for `.blf`
-            the number of the frame. Frames before it have been yielded.
+            the number of the frame. The frames before it have been yielded.
     """
     suffix = _known_suffix(path)
     try:
@@ -68,7 +69,7 @@ def read_can_log(path: Path, link: str | None = None) -> Iterator[CanCapture]:
 
 
 def channel_name(number: int) -> str:
-    """Return the name that frames of a channel of an `.asc` or `.blf` get: `can0` for channel 1."""
+    """Return the link name for a channel of an `.asc` or `.blf` log: `can0` for channel 1."""
     return f"can{number - 1}"
 
 
@@ -77,11 +78,11 @@ def write_can_log(path: Path, captures: Iterable[CanCapture], channels: Mapping[
 
     Args:
         path: the file; its suffix is one of FORMATS.
-        captures: in order.
-        channels: link -> its channel number, from 1, in `.asc` and `.blf`; None: in order of appearance.
+        captures: the frames, in order.
+        channels: link -> channel number (from 1) in `.asc` and `.blf`; None to number links in order of appearance.
 
     Raises:
-        DescriptionError: not one of FORMATS, the file cannot be written, or a link's name has blanks (candump).
+        DescriptionError: not one of FORMATS, the file cannot be written, or a link's name contains blanks (candump).
     """
     suffix = _known_suffix(path)
     try:
@@ -95,13 +96,13 @@ def write_can_log(path: Path, captures: Iterable[CanCapture], channels: Mapping[
 def _known_suffix(path: Path) -> str:
     suffix = path.suffix.lower()
     if suffix not in FORMATS:
-        raise DescriptionError(str(path), f"not a CAN log that is known by its suffix: {', '.join(FORMATS)}")
+        raise DescriptionError(str(path), f"not a known CAN log; its suffix must be one of {', '.join(FORMATS)}")
     return suffix
 
 
 def _stamp(utc_ns: int, where: str) -> Stamp:
     if not 0 <= utc_ns < 1 << 63:
-        raise DescriptionError(where, "the frame's time lies before 1970 or after 2262")
+        raise DescriptionError(where, "the frame's time is before 1970 or after 2262")
     return Stamp(utc_ns, utc_ns, "log")
 
 
@@ -127,15 +128,15 @@ def _candump_frame(text: str, link: str | None, where: str, *, is_ended: bool) -
     if not is_ended and not direction and data is not None and len(data) < 2 * DATA_MAX:
         raise DescriptionError(
             where,
-            f"the last line has no end, its frame may be cut short: {text[:80]!r}; "
-            "end the line if it is whole, or take it out",
+            f"the last line has no line end, so its frame may be truncated: {text[:80]!r}; "
+            "add a line end if the frame is complete, or remove the line",
         )
     arbitration_id = int(identifier, 16)
     is_long = len(identifier) == 8
     is_error = is_long and bool(arbitration_id & _ERR_FLAG)
     arbitration_id &= ~_ERR_FLAG if is_error else 0xFFFFFFFF
     if arbitration_id > (EXTENDED_ID_MAX if is_long else STANDARD_ID_MAX):
-        raise DescriptionError(where, f"identifier {identifier} is beyond what CAN has: {text[:80]!r}")
+        raise DescriptionError(where, f"identifier {identifier} is too large for CAN: {text[:80]!r}")
     return CanCapture(
         channel if link is None else link,
         _stamp(int(seconds) * 1_000_000_000 + int(fraction.ljust(9, "0")), where),
@@ -153,7 +154,11 @@ def _write_candump(path: Path, captures: Iterable[CanCapture]) -> int:
     with path.open("w", encoding="utf-8", newline="\n") as file:
         for capture in captures:
             if not capture.link or any(map(str.isspace, capture.link)):
-                raise DescriptionError(str(path), f"link name {capture.link!r} cannot be a channel of candump's")
+                raise DescriptionError(
+                    str(path),
+                    f"link name {capture.link!r} cannot be a candump channel: it is empty or has blanks; rename the "
+                    "link, or use .asc or .blf",
+                )
             if capture.is_error:
                 identifier = f"{_ERR_FLAG | capture.arbitration_id:08X}"
             else:
@@ -183,30 +188,30 @@ def _read_blf(path: Path, link: str | None) -> Iterator[CanCapture]:
             reader = BlfReader(file)
             size = path.stat().st_size
             if size < reader.file_size:
-                raise DescriptionError(str(path), f"cut short: its header says {reader.file_size} bytes, it has {size}")
+                raise DescriptionError(str(path), f"truncated: it has {size} bytes, its header {reader.file_size}")
             for message in reader:
                 number += 1
                 if number > reader.object_count > 0:
-                    raise DescriptionError(str(path), f"has more frames than the {number - 1} that its header says")
+                    raise DescriptionError(str(path), f"has more frames than the {number - 1} that its header states")
                 yield _capture(message, link, f"{path}: frame {number}")
         except (zlib.error, ValueError, ArithmeticError) as error:
             raise DescriptionError(str(path), f"not a valid BLF file after frame {number}: {error}") from error
 
 
 def _capture(message: can.Message, link: str | None, where: str) -> CanCapture:
-    """Convert a message of python-can's readers, if it is a classic CAN frame."""
+    """Convert a python-can message; DescriptionError if it is not a classic CAN frame."""
     data = bytes(message.data)
     if message.is_fd or message.dlc > DATA_MAX:
         raise DescriptionError(where, "CAN FD frames are not supported")
     if not message.is_remote_frame and not message.is_error_frame and len(data) != message.dlc:
-        raise DescriptionError(where, f"the frame says {message.dlc} bytes and has {len(data)}")
+        raise DescriptionError(where, f"the frame has {len(data)} bytes, but its length is given as {message.dlc}")
     is_extended = message.is_extended_id and not message.is_error_frame
     if (
         not 0
         <= message.arbitration_id
         <= (EXTENDED_ID_MAX if is_extended or message.is_error_frame else STANDARD_ID_MAX)
     ):
-        raise DescriptionError(where, f"identifier {message.arbitration_id:X}h is beyond what CAN has")
+        raise DescriptionError(where, f"identifier {message.arbitration_id:X}h is too large for CAN")
     number = message.channel + 1 if isinstance(message.channel, int) else 1
     return CanCapture(
         channel_name(number) if link is None else link,
@@ -230,7 +235,7 @@ def _write_vector(path: Path, captures: Iterable[CanCapture], given: Mapping[str
             timestamp = _microseconds(capture) / 1e6
             number = seen.setdefault(capture.link, len(seen) + 1) if given is None else given[capture.link]
             if count == 0 and isinstance(writer, can.ASCWriter):
-                # Frames are counted from the header's start, whose milliseconds python-can writes without zeros
+                # Times count from the header's start, whose milliseconds python-can writes without leading zeros
                 writer.log_event("// start", math.floor(timestamp))
             writer.on_message_received(
                 can.Message(

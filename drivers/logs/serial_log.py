@@ -1,4 +1,4 @@
-"""Captured serial links as text files, one line a capture, after the manner of candump's logs for CAN.
+"""Captured serial links as text files with one capture per line, similar to candump's logs for CAN.
 
     rigcal-serial-capture 1
     link station
@@ -8,8 +8,9 @@
     1700000000.123456789 1000000000 rx 5130303630330d0a
     1700000000.223456789 1100000000 tx 4331313036370d0a
 
-A capture is UTC in seconds with nine digits, the monotonic clock in ns, direction, and the bytes in hexadecimal.
-`boot` names the boot that the monotonic clock of the lines after it belongs to. Lines that begin with `#` are comments.
+A capture line has UTC in seconds with nine decimals, the monotonic clock in ns, the direction, and the bytes in
+hexadecimal. A `boot` line gives the boot that the monotonic clock of the following lines belongs to. Lines that begin
+with `#` are comments.
 """
 
 from __future__ import annotations
@@ -36,11 +37,11 @@ _CAPTURE = re.compile(
 
 @dataclass(frozen=True, slots=True)
 class SerialLogHeader:
-    """Header of a captured file.
+    """Header of a capture file.
 
     Attributes:
         link: name of the link.
-        baud: bit/s.
+        baud: baud rate in bit/s.
         profile: profile of the station (`drivers.stations.profiles`).
     """
 
@@ -53,8 +54,8 @@ class SerialLogWriter:
     """Writes captures of one link to a text stream.
 
     Args:
-        stream: open for writing, UTF-8, line feeds alone as newlines; the caller closes it.
-        header: what to say of the link.
+        stream: text stream open for writing in UTF-8, with line feeds as line ends; the caller closes it.
+        header: description of the link.
     """
 
     def __init__(self, stream: TextIO, header: SerialLogHeader) -> None:
@@ -74,11 +75,11 @@ class SerialLogWriter:
 
 
 def read_serial_log(path: Path) -> Iterator[SerialCapture]:
-    """Yield the captures of a file, in its order.
+    """Yield the captures of a file in order.
 
     Raises:
-        DescriptionError: it cannot be read, is no captured serial link, or a line is malformed; the message names file
-            and line.
+        DescriptionError: the file cannot be read, is not a serial capture, or has a malformed line; the message names
+            file and line.
     """
     lines = _lines(path)
     link = _header(path, lines).link
@@ -93,23 +94,23 @@ def read_serial_log(path: Path) -> Iterator[SerialCapture]:
             raise DescriptionError(
                 f"{path}, line {number}",
                 "expected SECONDS.NANOSECONDS MONOTONIC_NS rx|tx HEXBYTES, or boot ID; "
-                "the line is damaged or the file is cut short",
+                "the line is damaged or the file is truncated",
             )
         if boot_id is None:
-            raise DescriptionError(f"{path}, line {number}", "expected boot ID before the first capture")
+            raise DescriptionError(f"{path}, line {number}", "expected a line 'boot ID' before the first capture")
         utc_ns = int(match["utc_s"]) * NS_PER_S + int(match["utc_ns"])
         stamp = Stamp(utc_ns, int(match["monotonic_ns"]), boot_id)
         yield SerialCapture(link, stamp, bytes.fromhex(match["data"]), match["direction"] == "tx")
 
 
 def _lines(path: Path) -> Iterator[tuple[int, str]]:
-    """Numbered lines without comments and empty lines."""
+    """Yield the lines with their numbers, without comments and empty lines."""
     try:
         with path.open("rb") as stream:
             for number, line in enumerate(bounded_lines(stream), 1):
                 text = line.rstrip(b"\r\n")
                 if text == line:
-                    raise DescriptionError(f"{path}, line {number}", "the line has no end: the file is cut short")
+                    raise DescriptionError(f"{path}, line {number}", "the line has no line end: the file is truncated")
                 if text and not text.startswith(b"#"):
                     yield number, _text(path, number, text)
     except OSError as error:
@@ -126,7 +127,7 @@ def _text(path: Path, number: int, line: bytes) -> str:
 def _header(path: Path, lines: Iterator[tuple[int, str]]) -> SerialLogHeader:
     number, line = next(lines, (1, ""))
     if line != _FIRST_LINE:
-        raise DescriptionError(f"{path}, line {number}", f"expected {_FIRST_LINE!r}: not a captured serial link")
+        raise DescriptionError(f"{path}, line {number}", f"expected {_FIRST_LINE!r}: this is not a serial capture file")
     values: dict[str, str] = {}
     for expected in _HEADER_KEYS:
         number, line = next(lines, (number + 1, ""))
@@ -134,5 +135,5 @@ def _header(path: Path, lines: Iterator[tuple[int, str]]) -> SerialLogHeader:
         if key != expected or not values[expected]:
             raise DescriptionError(f"{path}, line {number}", f"expected '{expected} ...', found {line!r}")
         if key == "baud" and not re.fullmatch(r"[1-9]\d{0,8}", values[key], re.ASCII):
-            raise DescriptionError(f"{path}, line {number}", f"baud {values[key]!r} is no positive whole number")
+            raise DescriptionError(f"{path}, line {number}", f"baud {values[key]!r} is not a positive whole number")
     return SerialLogHeader(values["link"], int(values["baud"]), values["profile"])

@@ -1,4 +1,4 @@
-"""Lines of a text, their cells, and the numbers in them."""
+"""Splitting a text into lines and cells, and reading the numbers in the cells."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from drivers.stations.export_format import refuse
 _NUMBER = re.compile(r"[+-]?(\d+([.,]\d*)?|[.,]\d+)([eE][+-]?\d+)?", re.ASCII)
 _BEFORE_BRACKET = re.compile(r"(?<!\s)\s++(?=[\[(])")  # blanks between a name and its unit
 WHOLE = re.compile(r"[+-]?\d+", re.ASCII)
-_NO_BLANKS = "an empty cell between blanks, or a blank in one, cannot be told; separate columns otherwise"
-_LARGEST = 1e12  # of coordinates, angles and seconds in any unit
+_NO_BLANKS = "blanks cannot separate columns if a cell is empty or contains a blank; use another separator"
+_LARGEST = 1e12  # limit for coordinates, angles and seconds in any unit
 
 
 def lines_of(text: str) -> list[str]:
@@ -21,13 +21,18 @@ def lines_of(text: str) -> list[str]:
 
 
 def line_at(lines: list[str], number: int, source: str) -> str:
-    """Return the line of a number from 1, which a map names.
+    """Return the line with a number given by a map.
+
+    Args:
+        lines: lines of the file.
+        number: line number, from 1.
+        source: name of the file, for error messages.
 
     Raises:
         DescriptionError: the file is shorter.
     """
     if number > len(lines):
-        refuse(source, f"the map's header is in line {number}, the file has {len(lines)}; is the map of another file?")
+        refuse(source, f"the map's header is in line {number}, the file has {len(lines)} lines; use the file's map")
     return lines[number - 1]
 
 
@@ -37,17 +42,17 @@ def cells_of(line: str, separator: str) -> list[str]:
         return _BEFORE_BRACKET.sub("", line).split()
     try:
         return [cell.strip() for cell in next(csv.reader([line], delimiter=separator), [])]
-    except csv.Error:  # a field of more characters than any that means something
+    except csv.Error:  # a field is longer than the csv module allows
         return []
 
 
 def is_no_row(line: str, separator: str) -> bool:
-    """Return whether a line of a table is empty in all its cells, or a remark that begins with #."""
+    """Return True if all cells of a line are empty, or if the line is a comment that begins with #."""
     return not line.strip(f'{separator} \t"') or line.lstrip().startswith("#")
 
 
 def number_of(cell: str, decimal: str) -> float | None:
-    """Return the number in a cell; None where there is none, or one beyond what any instrument measures."""
+    """Return the number in a cell; None if there is none, or if it is larger than any instrument measures."""
     if not _NUMBER.fullmatch(cell) or (decimal == "." and "," in cell):
         return None
     value = float(cell.replace(",", "."))
@@ -55,59 +60,59 @@ def number_of(cell: str, decimal: str) -> float | None:
 
 
 def why_no_number(cell: str) -> str:
-    """Return what is wrong with a cell that `number_of` finds no number in."""
+    """Return the error text for a cell in which `number_of` finds no number."""
     is_too_large = _NUMBER.fullmatch(cell) and number_of(cell, ",") is None
-    return f"{cell!r} is {'beyond what any instrument measures' if is_too_large else 'not a number'}"
+    return f"{cell!r} is {'larger than any instrument measures' if is_too_large else 'not a number'}"
 
 
 def why_too_many(cells: list[str], due: int, separator: str) -> str:
-    """Return what is wrong with a row of more cells than are due."""
-    said = f"{len(cells)} cells where {due} are due"
+    """Return the error text for a row with more cells than expected (`due`)."""
+    said = f"{len(cells)} cells instead of {due}"
     if separator == "," and not any("." in cell for cell in cells):
         todo = "export with decimal points, or with semicolons between columns"
-        return f"{said}: commas separate columns and are decimal signs as well; {todo}"
-    return f"{said}; {_NO_BLANKS}" if separator == " " else f"{said}: two lines may be one, or a cell too many"
+        return f"{said}: commas are used both between columns and as decimal signs; {todo}"
+    return f"{said}; {_NO_BLANKS}" if separator == " " else f"{said}: remove the extra cell, or split joined lines"
 
 
 def why_too_few(cells: list[str], due: int, separator: str) -> str:
-    """Return what is wrong with a row of fewer cells than are due."""
+    """Return the error text for a row with fewer cells than expected (`due`)."""
     said = (
-        f"{len(cells)} {'cell' if len(cells) == 1 else 'cells'} where {due} are due: one is missing, or the line is cut"
+        f"{len(cells)} {'cell' if len(cells) == 1 else 'cells'} instead of {due}: a cell is missing or the line is cut"
     )
-    todo = "give each row its empty cells too, or take a column that is mostly empty out of the file"
+    todo = "write empty cells too, or remove a column that is mostly empty from the file"
     return f"{said}; {_NO_BLANKS if separator == ' ' else todo}"
 
 
 def decimal_of(cells: Iterable[str]) -> str:
-    """Return the sign before fractions: a comma where it is in numbers, between quotes if it separates them too."""
+    """Return the decimal sign: a comma if any number has one (quoted if commas also separate columns), else a point."""
     return "," if any("," in cell and _NUMBER.fullmatch(cell) for cell in cells) else "."
 
 
 class Numbers:
-    """Numbers of a file, which has one sign before their fractions.
+    """Reader of the numbers of a file, all of which must use the same decimal sign.
 
     Args:
-        decimal: the sign.
-        source: name of the file, for messages.
+        decimal: the decimal sign.
+        source: name of the file, for error messages.
     """
 
     def __init__(self, decimal: str, source: str) -> None:
         self.decimal = decimal
         self.source = source
-        self._first: dict[str, tuple[int, str]] = {}  # sign -> line and cell that had it first
+        self._first: dict[str, tuple[int, str]] = {}  # sign -> line and cell in which it first appears
 
     def find(self, cell: str, line: int) -> float | None:
-        """Return the number in a cell, None where there is none.
+        """Return the number in a cell; None if there is none.
 
         Raises:
-            DescriptionError: it has another sign than a number before it, so one of them separates thousands.
+            DescriptionError: the file has both decimal points and commas, so one of them may separate thousands.
         """
         for sign in ".,":
             if sign in cell and sign not in self._first and _NUMBER.fullmatch(cell):
                 self._first[sign] = (line, cell)
         if len(self._first) > 1:
             before, other = next(iter(self._first.values()))
-            both = f"{cell!r}, and {other!r} in line {before}: both a point and a comma stand before fractions"
+            both = f"{cell!r}, and {other!r} in line {before}: both points and commas are decimal signs"
             refuse(
                 self.source, f"{both}, or one of them separates thousands; export without thousands separators", line
             )
@@ -117,10 +122,10 @@ class Numbers:
         """Return the number in a cell.
 
         Raises:
-            DescriptionError: there is none, or `find` raises it.
+            DescriptionError: there is no number, or `find` raises the error.
         """
         value = self.find(cell, line)
         if value is None:
-            said = why_no_number(cell) if cell else "the cell is empty; leave out lines without a measurement"
+            said = why_no_number(cell) if cell else "the cell is empty; remove lines without a measurement"
             refuse(self.source, said, line, column)
         return value

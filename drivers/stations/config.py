@@ -12,25 +12,26 @@ from drivers.stations.serial_port import SerialConfig
 
 
 class StationConfig(ProfileOptions, PollTiming):
-    """A total station and how to listen to it.
+    """A total station and how it is read.
 
-    Its profile's options and its time-outs are the bases' fields.
+    The base classes define the options of its profile and its timeouts.
 
     Attributes:
-        name: of the station; its captures, fixes and events carry it.
+        name: name of the station in its captures, fixes and events.
         profile: name of a profile in `drivers.stations.profiles`.
-        serial: its port.
+        serial: its serial port.
         listen_to: family of the station whose records a passive listener expects.
-        link_delay_s: constant delay from the measurement to the first byte on the host. Fixes do not contain it; it is
-            taken off where they are joined with the joints.
+        link_delay_s: constant delay from the measurement to the first byte on the host. It is not included in fixes,
+            but subtracted when they are combined with the joints.
         max_speed_m_s: see `relock_within_m`.
         jump_slack_m: see `relock_within_m`.
-        relock_within_m: a target that moves by more than the first two allow from one fix to the next may be another
-            prism, and so may one that is locked, after the prism was lost, further than this from where that was. In a
-            session such fixes do not count until the station is back or an operator confirms the prism.
-        max_range_m: a fix further away is refused. The default is the longest that distance meters of these families
-            measure to a single prism, under good conditions.
-        silence_timeout_s: no record for longer than this is a gap; 0 for a station that speaks when it is told to.
+        relock_within_m: the target may be a different prism if it moves from one fix to the next by more than
+            `max_speed_m_s` and `jump_slack_m` allow, or if after a loss the station locks farther than this from
+            where it lost the prism. In a session such fixes do not count until the station is back on the prism or an
+            operator confirms it.
+        max_range_m: a fix farther away is refused. The default is the longest distance that the distance meters of
+            these families measure to a single prism under good conditions.
+        silence_timeout_s: no record for longer than this is a gap; 0 for a station that only measures on request.
     """
 
     name: str = Field(default="station", pattern=r"^[A-Za-z][A-Za-z0-9_]*$")
@@ -49,8 +50,8 @@ class StationConfig(ProfileOptions, PollTiming):
     def _no_prism_is_accepted_by_time(cls, given: object) -> object:
         if isinstance(given, dict) and "new_target_after_s" in given:
             raise ValueError(
-                "new_target_after_s is gone, remove it: another prism is never taken for the one that is meant because "
-                "time has passed; `rigcal session confirm-prism` says that it is"
+                "new_target_after_s no longer exists, remove it: a prism is never accepted because time has passed; "
+                "confirm it with `rigcal session confirm-prism`"
             )
         return given
 
@@ -72,7 +73,7 @@ class StationConfig(ProfileOptions, PollTiming):
 
     @property
     def station_profile(self) -> StationProfile:
-        """The profile itself."""
+        """The profile object."""
         return station_profiles()[self.profile]
 
     @property
@@ -82,11 +83,11 @@ class StationConfig(ProfileOptions, PollTiming):
 
     @property
     def tracks_silently(self) -> bool:
-        """True if the station follows its prism by itself although its records say nothing of its lock."""
+        """True if the station tracks its prism although its records do not contain its lock state."""
         return self.station_profile.untold_tracking in self.init
 
     def reply_reader(self) -> ReplyReader:
-        """Make a fresh reader of the station's replies."""
+        """Create a new reader of the station's replies."""
         codec = self.codec
         parser = codec.parser(self.name, self)
         return ReplyReader(self.name, codec.framer(), parser, codec.shortest_record, self.serial.character_s)

@@ -1,4 +1,4 @@
-"""Decoder of a total station: captures to fixes, events and gaps, silence and lock judged from the fixes."""
+"""Decoder of a total station: captures to fixes, events and gaps; silence and loss of lock are derived from fixes."""
 
 from __future__ import annotations
 
@@ -23,20 +23,20 @@ from drivers.stations.config import StationConfig
 from drivers.stations.replies import Reply
 from drivers.stations.survey import position_mm, range_checked
 
-_UNFINISHED_NS = 2 * NS_PER_S  # an unfinished record is given up after this; the slowest takes 0.6 s at 1200 baud
+_UNFINISHED_NS = 2 * NS_PER_S  # an unfinished record is discarded after this; the slowest takes 0.6 s at 1200 baud
 
 Point = tuple[float, float, float]
 
 
 class StationDecoder:
-    """Captures of a station's link to fixes, events, gaps and failures (`drivers.readings.Decoder`).
+    """Decodes captures of a station's link into fixes, events, gaps and failures (`drivers.readings.Decoder`).
 
-    A fix is stamped with the arrival of its first byte; where that is doubtful, the fix may not be used. Transmitted
-    captures yield nothing; an answer arrives after them. What the passing of time alone causes is stamped with the
-    instant at which it was due, so records do not depend on how often `tick` is called.
+    A fix is stamped with the arrival of its first byte; if that time is doubtful, the fix may not be used. Transmitted
+    captures give no records. Records caused by the passing of time are stamped with the instant at which they were due,
+    so they do not depend on how often `tick` is called.
 
     Args:
-        config: the station, as its link has it.
+        config: configuration of the station, the same as its link's.
     """
 
     def __init__(self, config: StationConfig) -> None:
@@ -59,9 +59,9 @@ class StationDecoder:
     def tick(self, now: Stamp) -> list[Record]:
         records: list[Record] = []
         if self._last_byte is not None and now.since(self._last_byte) > _UNFINISHED_NS:
-            # In the order of their deadlines, so that it does not matter how often time is told.
+            # In the order of their deadlines, so that the result does not depend on how often `tick` is called
             records += self._silence.tick(self._last_byte.shifted(_UNFINISHED_NS))
-            for reply in self._reader.flush("record broken off"):
+            for reply in self._reader.flush("incomplete record"):
                 records += reply.records
             self._last_byte = None
         return records + self._silence.tick(now)
@@ -79,18 +79,18 @@ class StationDecoder:
 
 
 def _without_time(fix: Fix) -> Fix:
-    """A fix whose bytes were read late: it may not be used, because it is not known when it was measured."""
+    """Return a fix that was read late as unusable, because the time of its measurement is unknown."""
     if fix.status is not Status.OK:
         return fix
     return replace(fix, status=Status.TIME_DOUBTFUL, reason=f"its time is doubtful: {NOT_READ_IN_TIME}")
 
 
 class SilenceWatch:
-    """Reports a station that gives no more records.
+    """Reports a station that sends no more records.
 
     Args:
-        station: its name.
-        timeout_s: no record for longer than this is silence; 0: never.
+        station: name of the station.
+        timeout_s: no record for longer than this is silence; 0 to disable.
     """
 
     def __init__(self, station: str, timeout_s: float) -> None:
@@ -100,21 +100,21 @@ class SilenceWatch:
         self._silent = False
 
     def tick(self, now: Stamp) -> list[Record]:
-        """Return the event and the open gap, once, when silence has begun."""
+        """Return the event and the open gap once when a silence has begun."""
         if self._heard is None or (not self._silent and self._heard.boot_id != now.boot_id):
             self._heard = now
         if self._silent or not self._timeout_s or now.since(self._heard) <= self._timeout_s * NS_PER_S:
             return []
         self._silent = True
         due = self._heard.shifted(round(self._timeout_s * NS_PER_S))
-        text = f"no record for {self._timeout_s:g} s"
+        text = f"no record for {self._timeout_s:g} s; check the station, its power and its cable"
         return [
             DeviceEvent(self._station, due, EventKind.STATION_SILENT, text),
             Gap(self._station, GapReason.SILENT, self._heard),
         ]
 
     def heard(self, fix: Fix) -> list[Record]:
-        """Return the closed gap, when this record ends a silence."""
+        """Return the closed gap if this record ends a silence."""
         was_silent, since = self._silent, self._heard
         self._silent, self._heard = False, fix.last_byte
         return [Gap(self._station, GapReason.SILENT, since, fix.stamp)] if was_silent and since is not None else []
@@ -123,8 +123,8 @@ class SilenceWatch:
 class LockWatch:
     """Turns the lock states of a tracking station's fixes into events and gaps.
 
-    A station holds its target when its tracking flag says locked and there is a distance. Fixes of stations that do
-    not say (`LockState.UNKNOWN`) pass unseen.
+    A station holds its target if its tracking flag is "locked" and there is a distance. Fixes of stations without such
+    a flag (`LockState.UNKNOWN`) are ignored.
     """
 
     def __init__(self, station: str) -> None:
@@ -134,7 +134,7 @@ class LockWatch:
         self._lost_since: Stamp | None = None
 
     def see(self, fix: Fix) -> list[DeviceEvent | Gap]:
-        """Return the events and gaps that this fix brings."""
+        """Return the events and gaps caused by this fix."""
         if fix.lock is LockState.UNKNOWN:
             return []
         held = fix.lock is LockState.LOCKED and fix.slope_distance_m is not None

@@ -1,4 +1,4 @@
-"""Tables of text, one point a line, as a map says."""
+"""Text tables with one point per line, read according to a map."""
 
 from __future__ import annotations
 
@@ -32,13 +32,20 @@ from drivers.stations.named_units import mm_of
 from drivers.stations.table_columns import CARTESIAN, POLAR
 from drivers.stations.table_guess import CLOCK_FORMATS, guess_table
 
-_FEW_STATIONS = 2  # may have a row each
-_OWN_VALUES = 0.8  # share of rows with a value of their own beyond which a column names no set-ups
-_SLACK_RAD = 1e-6  # of angles that are rounded
+_FEW_STATIONS = 2  # so few different values always count as set-ups, even with one row each
+_OWN_VALUES = 0.8  # a column with more different values than this share of the rows does not name set-ups
+_SLACK_RAD = 1e-6  # tolerance for rounded angles
 
 
 def delimited_format(name: str, title: str, rank: int, recognises: Callable[[str], bool]) -> ExportFormat:
-    """Return a format of tables with one point a line."""
+    """Return a format of tables with one point per line.
+
+    Args:
+        name: name of the format in maps.
+        title: name of the format for people.
+        rank: formats with a lower rank are tried first.
+        recognises: returns True for a text of this format.
+    """
 
     def guess(text: str, source: str) -> Guess:
         return guess_table(text, source, name)
@@ -47,10 +54,16 @@ def delimited_format(name: str, title: str, rank: int, recognises: Callable[[str
 
 
 def read_table(text: str, columns: ColumnMap, source: str) -> list[ExportedFix]:
-    """Read a table, one point a line.
+    """Read a table with one point per line.
+
+    Args:
+        text: content of the file.
+        columns: map of its columns.
+        source: name of the file, for error messages.
 
     Raises:
-        DescriptionError: a column is missing, or a cell is no number; with file, line, column and reason.
+        DescriptionError: a column is missing, or a cell is not a number; the message gives file, line, column and
+            reason.
     """
     lines = lines_of(text)
     at = columns.header_line
@@ -83,7 +96,7 @@ def read_table(text: str, columns: ColumnMap, source: str) -> list[ExportedFix]:
         def unit_at(role: Role, otherwise_mm: float) -> float:
             return mm_of("".join(header[places[role] :][:1]), otherwise_mm)
 
-        constant = number_of(text_at("prism_constant"), columns.decimal)  # for a note alone: anything may stand there
+        constant = number_of(text_at("prism_constant"), columns.decimal)  # only for a note, so any content is accepted
         constant_mm = None if constant is None else constant * unit_at("prism_constant", 1.0)
         is_below = not is_polar and text_at("target_height") != ""
         height_mm = number_at("target_height") * unit_at("target_height", mm) if is_below else None
@@ -104,7 +117,7 @@ def read_table(text: str, columns: ColumnMap, source: str) -> list[ExportedFix]:
             )
         )
     if not fixes:
-        refuse(source, "no points below the header")
+        refuse(source, "there are no points below the header")
     if is_polar:
         _check_zeniths(zeniths, columns, source)
     if len({fix.target_height_mm for fix in fixes}) > 1:
@@ -117,10 +130,11 @@ def read_table(text: str, columns: ColumnMap, source: str) -> list[ExportedFix]:
 def _rows(
     lines: list[str], columns: ColumnMap, header: list[str], measured: list[int], source: str
 ) -> list[tuple[int, list[str]]]:
-    """Return the cells of each row, with its line; empty rows and remarks (#) are passed over.
+    """Return the line number and the cells of each row; empty rows and comments (#) are skipped.
 
-    A row has a cell for each name of the header, or for each cell of the first row; empty ones at the end of both do
-    not count. All rows may end before the header does, as a spreadsheet leaves out columns that are empty.
+    Every row must have a cell for each name in the header, or without a header for each cell of the first row; empty
+    names or cells at the end do not count. All rows may be shorter than the header by the same number of cells, because
+    a spreadsheet leaves out empty columns.
     """
     rows = []
     for number, line in enumerate(lines[columns.first_line - 1 :], columns.first_line):
@@ -130,7 +144,7 @@ def _rows(
         elif all(place < len(cells) and number_of(cells[place], columns.decimal) is not None for place in measured):
             refuse(
                 source,
-                "# begins a remark, but this may be a point: delete the line, or call the point otherwise",
+                "# begins a comment, but this may be a point: delete the line, or rename the point",
                 number,
             )
     first = header or (rows[0][1] if rows else [])
@@ -147,61 +161,63 @@ def _rows(
 
 
 def _check_zeniths(zeniths: Mapping[int, float], columns: ColumnMap, source: str) -> None:
-    """Refuse zenith angles that are none, or that look like angles from the horizon."""
+    """Refuse zenith angles that are out of range or look like angles from the horizon."""
     todo = "from the zenith (90 deg or 100 gon is level); export zenith angles"
     for line, zenith in zeniths.items():
         if not -_SLACK_RAD <= zenith <= math.tau + _SLACK_RAD:
-            said = f"below 0 or beyond a full circle in {columns.angle_unit}, so it is no angle"
+            said = f"below 0 or above a full circle in {columns.angle_unit}, so it is not an angle"
             refuse(source, f"{said} {todo}", line, columns.columns["zenith"])
     if all(min(zenith, math.tau - zenith) < math.pi / 4 for zenith in zeniths.values()):
-        said = "all angles are nearer to 0 than half a right one: they look like angles from the horizon, not"
+        said = "all angles are within 45 deg of 0, so they look like angles from the horizon, not"
         refuse(source, f"{said} {todo}", min(zeniths), columns.columns["zenith"])
 
 
 def _refuse_target_heights(fixes: list[ExportedFix], columns: ColumnMap, source: str) -> NoReturn:
     first = fixes[0].target_height_mm
     line = next(fix.line for fix in fixes if fix.target_height_mm != first)
-    said = f"another target height than in line {fixes[0].line}, so coordinates are of places at different heights"
+    said = f"the target height differs from line {fixes[0].line}, so coordinates are of places at different heights"
     todo = "export with target heights of 0, or one file for each height"
     refuse(source, f"{said} below the prism; {todo}", line, columns.columns["target_height"])
 
 
 def _check_stations(fixes: list[ExportedFix], columns: ColumnMap, source: str) -> None:
-    """Refuse a column of stations that some rows leave open, or that says another thing in nearly every row.
+    """Refuse a column of stations that is empty in some rows or has a different value in nearly every row.
 
-    An empty cell may mean the station above it, or none; chainages and points' names differ from row to row.
+    An empty cell could mean the station above it or none. Chainages and point names differ from row to row.
     """
     found = {fix.station for fix in fixes}
     if "" in found and len(found) > 1:
         line = next(fix.line for fix in fixes if not fix.station)
-        refuse(source, "names no station, as other rows do; fill it in", line, columns.columns["station"])
+        refuse(source, "the station is missing, but not in other rows; fill it in", line, columns.columns["station"])
     if len(found) > max(_FEW_STATIONS, _OWN_VALUES * len(fixes)):
         said = f"{len(found)} different values in {len(fixes)} rows, so it does not name set-ups"
-        reason = f"{said}; call the column otherwise ('point' if it names points), or leave station out of a map"
+        reason = f"{said}; rename the column ('point' if it names points), or remove station from the map"
         refuse(source, reason, columns.header_line or None, columns.columns["station"])
 
 
 def _place(column: str | int, header: list[str], header_line: int, source: str) -> int:
     if isinstance(column, int):
         if column < 1:
-            refuse(source, "columns of the map are counted from 1", None, column)
+            refuse(source, "the map counts columns from 1", None, column)
         return column - 1
     if header.count(column) != 1:
-        problem = "is not in the header" if column not in header else "is in the header twice; give its number"
-        refuse(source, f"the column of the map {problem}; there are {', '.join(header)}", header_line or None, column)
+        problem = "is not in the header" if column not in header else "is in the header more than once; give its number"
+        refuse(source, f"the map's column {problem}; columns: {', '.join(header)}", header_line or None, column)
     return header.index(column)
 
 
 def _cell(cells: list[str], place: int, column: str | int, line: int, source: str) -> str:
     if place >= len(cells):
-        refuse(source, f"the line has {len(cells)} columns only", line, column)
+        refuse(source, f"the line has only {len(cells)} columns", line, column)
     return cells[place]
 
 
 def _time(text: str, columns: ColumnMap, numbers: Numbers, line: int) -> tuple[float | None, bool | None]:
-    """Return seconds: of a number as it is, of a date since 1970, of a time of day since midnight.
+    """Return a time in seconds, and whether its zone is known.
 
-    And whether it is of a named zone; None where it is no date.
+    Returns:
+        (time_s, has_zone): a number is returned unchanged, a date as seconds since 1970, a time of day as seconds since
+        midnight. `has_zone` is None if the text is not a date.
     """
     if not text or "time" not in columns.columns:
         return None, None
@@ -212,7 +228,7 @@ def _time(text: str, columns: ColumnMap, numbers: Numbers, line: int) -> tuple[f
         form = columns.time_format
         found = datetime.strptime(text, form) if form else datetime.fromisoformat(text)
     except ValueError:
-        said = columns.time_format or "seconds, or an ISO time"
+        said = columns.time_format or "seconds or an ISO time"
         refuse(numbers.source, f"{text!r} is not a time of the form {said}", line, columns.columns["time"])
     if columns.time_format in CLOCK_FORMATS:
         return found.hour * 3600.0 + found.minute * 60.0 + found.second + found.microsecond / 1e6, None

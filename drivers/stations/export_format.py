@@ -1,6 +1,6 @@
-"""Files that an instrument or its office program wrote: their fixes, and how their columns were understood.
+"""Files written by an instrument or its office program: their fixes, and the interpretation of their columns.
 
-A new format is one new file in `drivers/stations/exports`, with its `FORMAT`.
+To add a format, add a file with a `FORMAT` to `drivers/stations/exports`.
 """
 
 from __future__ import annotations
@@ -25,18 +25,18 @@ RAD_PER: dict[str, float] = {"deg": math.pi / 180, "gon": math.pi / 200, "rad": 
 
 
 class ColumnMap(BaseModel):
-    """Map of a file's columns: guessed from it, written beside the result, and given again with `--map`.
+    """Map of a file's columns: guessed from the file, written next to the result, and passed again with `--map`.
 
     Attributes:
         format: name of the format.
-        separator: between columns; a blank stands for any white space.
-        decimal: sign before the fraction of a number.
-        header_line: line of the column names, from 1; 0 without one.
-        first_line: the first line of data.
-        length_unit: of coordinates and distances.
-        angle_unit: of angles.
-        time_format: as `strptime` has it; "" for seconds, or ISO times.
-        rate_hz: frames a second, where the file counts frames.
+        separator: separator between columns; a blank means any white space.
+        decimal: decimal sign.
+        header_line: line of the column names, from 1; 0 if there is none.
+        first_line: first line of data, from 1.
+        length_unit: unit of coordinates and distances.
+        angle_unit: unit of angles.
+        time_format: format of times for `strptime`; "" for seconds or ISO times.
+        rate_hz: frames per second, if the file counts frames.
         columns: role -> name of the column, or its number from 1.
         prisms: name of a point, a code or a marker in the file -> prism of the rig.
     """
@@ -58,21 +58,21 @@ class ColumnMap(BaseModel):
 
 @dataclass(frozen=True, slots=True)
 class ExportedFix:
-    """A fix as a file has it.
+    """A fix from a file.
 
     Attributes:
-        line: where it stands, from 1.
+        line: line in the file, from 1.
         point: number or name of the point.
-        target: what was measured, as the file says it: a code, a marker; "" where it says nothing.
-        position_mm: east, north, up from the instrument's centre, where the file tells where that is.
-        time_s: when; seconds since 1970 where the file has a date, else since its own origin; None where it says
-            nothing.
-        station: where the instrument stood, as the file names it; another name is another set-up.
-        times_set_up: how often the file had set the instrument up by then, under any name; 0 where it does not say.
-        prism_constant_mm: that the instrument applied to the distance; None where the file does not say.
-        target_height_mm: of the prism above the place whose coordinates the file has; None where it does not say.
-        is_numbered: whether the file does not name the point, so that its number is that of the row.
-        has_zone: whether the time is of a named time zone; None where it is no date.
+        target: what was measured, as a code or marker of the file; "" if the file does not contain it.
+        position_mm: east, north, up; from the instrument's centre if the file contains the centre's position.
+        time_s: seconds since 1970 if the file has a date, else since the file's own origin; None if it has no times.
+        station: the file's name for the place of the instrument; a different name is a different set-up.
+        times_set_up: number of set-ups in the file up to this fix, under any name; 0 if the file does not record them.
+        prism_constant_mm: constant that the instrument applied to the distance; None if the file does not contain it.
+        target_height_mm: height of the prism above the place whose coordinates the file has; None if the file does not
+            contain it.
+        is_numbered: the file does not name the point, so its number is the number of the row.
+        has_zone: the time has a known time zone; None if it is not a date.
     """
 
     line: int
@@ -90,11 +90,11 @@ class ExportedFix:
 
 @dataclass(frozen=True)
 class Guess:
-    """Conclusions on how a file is to be read.
+    """The guessed interpretation of a file.
 
     Attributes:
-        map: the columns.
-        notes: sentences about what was concluded, and from what.
+        map: map of the columns.
+        notes: sentences about the conclusions and their reasons.
     """
 
     map: ColumnMap
@@ -103,16 +103,16 @@ class Guess:
 
 @dataclass(frozen=True, kw_only=True)
 class ExportFormat:
-    """A format of files.
+    """A file format.
 
     Attributes:
-        name: in maps.
-        title: for people.
-        rank: formats of a lower one are tried first.
-        recognises: whether a text is of this format.
-        guess: concludes from a text how to read it; gets the file's name for messages.
-        read: reads the fixes of a text.
-        passed_over: notes on the records of a text that look like points and are none; gets the file's name as well.
+        name: name in maps.
+        title: name for people.
+        rank: formats with a lower rank are tried first.
+        recognises: returns True if a text is of this format.
+        guess: guesses from (text, file name) how to read the text; the file name is for error messages.
+        read: reads the fixes from (text, map, file name).
+        passed_over: returns for (text, file name) notes on skipped records that look like points but are not.
     """
 
     name: str
@@ -125,12 +125,19 @@ class ExportFormat:
 
 
 def polar_position_mm(hz_rad: float, zenith_rad: float, distance_mm: float) -> tuple[float, float, float]:
-    """Return east, north, up of a point by horizontal angle (clockwise from north), zenith angle and slope distance."""
+    """Return east, north, up in mm from horizontal angle (clockwise from north), zenith angle and slope distance."""
     level_mm = distance_mm * math.sin(zenith_rad)
     return level_mm * math.sin(hz_rad), level_mm * math.cos(hz_rad), distance_mm * math.cos(zenith_rad)
 
 
 def refuse(source: str, reason: str, line: int | None = None, column: str | int | None = None) -> NoReturn:
-    """Raise DescriptionError for a file, with line, column and reason."""
+    """Raise DescriptionError for a file, with line, column and reason.
+
+    Args:
+        source: name of the file.
+        reason: the fault and what to do.
+        line: line number, from 1, if known.
+        column: number or name of the column, if known.
+    """
     place = source + (f", line {line}" if line is not None else "")
     raise DescriptionError(place + (f", column {column}" if column is not None else ""), reason)

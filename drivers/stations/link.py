@@ -1,4 +1,4 @@
-"""The loop that owns a total station's serial port, polls the station and captures what crosses the wire."""
+"""The loop that owns a total station's serial port, polls the station and captures all bytes in both directions."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ from drivers.stations.config import StationConfig
 from drivers.stations.poller import Poller
 from drivers.stations.serial_port import SerialPort
 
-_LONGEST_READ_S = 0.5  # how soon a loop with nothing to do notices that it is to stop
+_LONGEST_READ_S = 0.5  # longest delay until an idle loop notices a stop
 _LONGEST_WRITE_S = 5.0
 
 Emit = Callable[[LinkItem], None]
 
 
 class StationLink:
-    """Owns a station's port, opens it again when it was lost, talks to the station, hands on what crosses the wire.
+    """Owns a station's port: reopens it after a loss, polls the station and passes on all bytes as captures.
 
-    Records are decoded elsewhere, from the captures: here replies only tell the poller what to send next.
+    Records are decoded elsewhere from the captures. Here replies only determine what the poller sends next.
 
     Args:
-        config: the station.
-        clock: stamps captures, paces the polling.
+        config: configuration of the station.
+        clock: timestamps captures and times the polling.
     """
 
     def __init__(self, config: StationConfig, clock: Clock) -> None:
@@ -41,9 +41,9 @@ class StationLink:
         self._last_read = clock.now()
 
     def run(self, emit: Emit, stop: threading.Event) -> None:
-        """Listen and talk until `stop` is set.
+        """Poll and listen until `stop` is set.
 
-        Emits captures at once, LINK_UP, LINK_LOST, CONFIGURED and INSTRUMENT_ERROR events, and the LINK_DOWN gap.
+        Emits captures at once; LINK_UP, LINK_LOST, CONFIGURED and INSTRUMENT_ERROR events; and the LINK_DOWN gap.
         """
         backoff, outage = Backoff(), Outage(self.name, emit)
         with closing(watch_path(self._config.serial.path)) as watch:
@@ -59,7 +59,7 @@ class StationLink:
                         self._serve(port, emit, stop, began)
                 except LinkError as error:
                     now = self._clock.now()
-                    # What came since the last read is lost with the device, however long ago that was.
+                    # Everything since the last read is lost with the device, however long ago that read was
                     outage.begin(str(error), now, now if opened is None else self._last_read)
                     self.read_until = None
                     is_short_lived = opened is not None and now.since(opened) < BACKOFF_MAX_S * NS_PER_S
@@ -68,12 +68,12 @@ class StationLink:
                     pause_s = backoff.next_s()
                     real_s = min(pause_s, self._clock.real_seconds(pause_s))
                     if is_short_lived:
-                        stop.wait(real_s)  # it comes and goes by itself: to try whenever it comes would be to spin
+                        stop.wait(real_s)  # the device comes and goes; reacting to each return would be a busy loop
                     else:
                         watch.wait(stop, real_s)
 
     def _serve(self, port: SerialPort, emit: Emit, stop: threading.Event, began: Stamp) -> None:
-        """Talk to the station from the opening of its port, which `began` then, to `stop` or a LinkError."""
+        """Talk to the station until `stop` or a LinkError; `began` is the time just before its port was opened."""
         late = LateReport(self.name, "bytes", began)
         try:
             self._listen(port, emit, stop, late, StallDetector(self._clock, began))
@@ -114,7 +114,7 @@ class StationLink:
                 self._send(port, command, emit)
 
     def _send_due(self, port: SerialPort, poller: Poller, emit: Emit) -> float:
-        """Send what is due; return for how many seconds there is nothing more to send."""
+        """Send all commands that are due; return the seconds until the next one."""
         now_ns = self._clock.monotonic_ns()
         while (command := poller.step(now_ns)) is not None:
             self._send(port, command, emit)
@@ -130,7 +130,7 @@ class StationLink:
 
 
 def start_poller(config: StationConfig) -> Poller | None:
-    """Return a fresh poller of the station; None where its profile sends nothing."""
+    """Return a new poller of the station; None if its profile sends nothing."""
     profile, codec = config.station_profile, config.codec
     if profile.plan is None:
         return None

@@ -1,4 +1,4 @@
-"""Units: their words, and those that a table names in its header or in the line below that."""
+"""Units: the words for them, and the units that a table gives in its header or in the line below."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _SAID_OF_COLUMNS = (
     "horizontal zenith slope ortho orthometric ellipsoidal rechtswert hochwert höhe hoehe rw hw grid nn nhn msl"
 )
 _REMARKS = frozenset(_SAID_OF_COLUMNS.split())
-_REMARK = re.compile(r"\d+|(?:utm|gk)\d*[a-z]?")  # a number of the column, a zone of a grid
+_REMARK = re.compile(r"\d+|(?:utm|gk)\d*[a-z]?")  # number of a column, zone of a grid
 _NO_SECONDS = re.compile(r"[mµμun]s|[mun]secs?|(?:milli|micro|nano)sec\w*|min|minutes|h|hours|days|millis")
 _OF_LENGTHS = (
     "coordinate coordinates dimension dimensions distance distances length lengths linear koordinaten maße "
@@ -36,13 +36,13 @@ _OF_LENGTHS = (
 
 @dataclass(frozen=True)
 class Quantity:
-    """Kind of measured numbers.
+    """Kind of a measured quantity.
 
     Attributes:
-        name: in messages.
+        name: name in messages.
         words: word for a unit -> unit.
-        others: units that are not read.
-        subjects: words that speak of it.
+        others: pattern of units that are not supported.
+        subjects: words that refer to the quantity.
     """
 
     name: str
@@ -51,7 +51,7 @@ class Quantity:
     subjects: frozenset[str]
 
     def known_units(self) -> str:
-        """Return the units that are read, as a sentence lists them."""
+        """Return the supported units as a list in a sentence."""
         *units, last = dict.fromkeys(self.words.values())
         return f"{', '.join(units)} or {last}"
 
@@ -74,36 +74,36 @@ ANGLES = Quantity(
 
 
 def without_unit(name: str) -> str:
-    """Return the name of a column, in small letters, without what stands in brackets."""
+    """Return the name of a column in lower case, without text in brackets and without a unit at its end."""
     return _UNIT.sub("", name.lower())
 
 
 def mm_of(name: str, otherwise_mm: float) -> float:
-    """Return the millimetres of the unit that a column's name has, or those given where it has none."""
+    """Return the length in mm of the unit in a column's name, or `otherwise_mm` if it has none."""
     words = [word.lower() for word in bracket_words(name)]
     return next((MM_PER[_LENGTH_WORDS[word]] for word in words if word in _LENGTH_WORDS), otherwise_mm)
 
 
 def bracket_words(name: str) -> list[str]:
-    """Return what stands in brackets in the name of a column, and a unit at its end."""
+    """Return the texts in brackets in the name of a column, and a unit at its end."""
     return [(found[1] or found[2]).strip() for found in _UNIT.finditer(name)]
 
 
 def unit_of_columns(
     quantity: Quantity, header_line: int, columns: Sequence[str], units_line: int, below: Sequence[str], source: str
 ) -> tuple[str, str] | None:
-    """Return the unit that the names of some columns have, or the cells below them, and where it is said.
+    """Return (unit, source of the unit) from the names of some columns or the cells below them; None if there is none.
 
     Args:
-        quantity: of the columns.
-        header_line: line of the names.
-        columns: the names.
-        units_line: line of the cells below; 0 where there is none.
-        below: the cell below each name; "" where there is none.
-        source: name of the file, for messages.
+        quantity: quantity of the columns.
+        header_line: line number of the names.
+        columns: names of the columns.
+        units_line: line number of the cells below the names; 0 if there is none.
+        below: the cell below each name; "" if there is none.
+        source: name of the file, for error messages.
 
     Raises:
-        DescriptionError: a word in brackets, or below a name, is no unit that is known, or there are two units.
+        DescriptionError: a word in brackets or below a name is not a known unit, or there are two different units.
     """
     units: dict[str, str] = {}  # unit -> the first column that has it
     for column, cell in zip(columns, below, strict=True):
@@ -112,8 +112,8 @@ def unit_of_columns(
             if plain in quantity.words:
                 units.setdefault(quantity.words[plain], column)
             elif not _is_remark(plain) and (line == header_line or any(map(str.isalpha, word))):
-                todo = f"export {quantity.known_units()}, or take {word!r} out if it is a remark"
-                refuse(source, f"{word!r} is no unit of {quantity.name} that is known; {todo}", line, column)
+                todo = f"export {quantity.known_units()}, or remove {word!r} if it is a remark"
+                refuse(source, f"{word!r} is not a known unit of {quantity.name}; {todo}", line, column)
     if len(units) > 1:
         different = " and ".join(f"{cell!r} in {unit}" for unit, cell in units.items())
         refuse(source, f"the columns have different units, {different}; export them in one unit")
@@ -121,7 +121,7 @@ def unit_of_columns(
 
 
 def _words_of(column: str, header_line: int, below: str, units_line: int) -> list[tuple[int, str]]:
-    """Return the words that may be a column's unit, with their lines: in its name, and in the cell below that."""
+    """Return line number and text of each word in a column's name and in the cell below that may be its unit."""
     under = below.strip("[]() ")
     return [(header_line, word) for word in bracket_words(column)] + [(units_line, under)] * bool(under)
 
@@ -132,7 +132,18 @@ def _is_remark(word: str) -> bool:
 
 
 def check_seconds(column: str, header_line: int, below: str, units_line: int, source: str) -> None:
-    """Refuse a column of times in another unit than seconds, by its name or the cell below that."""
+    """Refuse a column of times whose name, or the cell below, gives a unit other than seconds.
+
+    Args:
+        column: name of the column.
+        header_line: line number of the names.
+        below: cell below the name; "" if there is none.
+        units_line: line number of that cell; 0 if there is none.
+        source: name of the file, for error messages.
+
+    Raises:
+        DescriptionError: the unit is not seconds.
+    """
     for line, word in _words_of(column, header_line, below, units_line):
         if _NO_SECONDS.fullmatch(word.lower()):
-            refuse(source, f"times in {word!r} are not read; export seconds, or dates with times", line, column)
+            refuse(source, f"times in {word!r} are not supported; export seconds, or dates with times", line, column)

@@ -1,9 +1,9 @@
-"""Polling of a total station: a state machine without port, thread or clock that says what to send next.
+"""Polling of a total station: a state machine without port, thread or clock that decides what to send next.
 
     set-up command -> acknowledged, each in turn
     request        -> [acknowledged] -> record -> [host acknowledges] -> pause -> request ...
 
-It goes on for ever: an instrument that is switched off is asked again until it answers.
+Polling never ends: an instrument that is switched off receives requests until it answers again.
 """
 
 from __future__ import annotations
@@ -19,19 +19,19 @@ from drivers.readings import EventKind, SerialCapture
 from drivers.settings import Settings
 from drivers.stations.replies import ReplyKind, ReplyReader
 
-_IDLE_NS = NS_PER_S  # a record that stops for longer than this is broken off
+_IDLE_NS = NS_PER_S  # a record that pauses for longer than this is incomplete
 
 
 class PollTiming(Settings):
-    """Time-outs in seconds, from programs that have driven these instruments.
+    """Timeouts in seconds, taken from existing programs for these instruments.
 
     Attributes:
-        poll_interval_s: from one request to the next, if the answer is there by then.
+        poll_interval_s: from one request to the next, if the answer has arrived by then.
         ack_timeout_s: a command that is not acknowledged is sent again after this.
         reply_timeout_s: from acknowledgement to record.
-        give_up_s: a command without any answer is given up after this.
-        relock_after_s: off target for longer than this, the station is told once more to track; until then its own
-            prediction, waiting and search are left to work.
+        give_up_s: a command without any answer is abandoned after this.
+        relock_after_s: a station that is off target for longer than this gets the command to track again; until then
+            its own prediction, waiting and search have time to work.
     """
 
     poll_interval_s: float = Field(default=0.1, ge=0)
@@ -46,15 +46,16 @@ class CommandPlan:
     """Commands of a station, and the pause between them.
 
     Attributes:
-        request: asks for a record.
-        setup: commands that are acknowledged.
-        opening: sent first; no answer is expected.
+        request: command that requests a record.
+        setup: set-up commands; the instrument acknowledges each.
+        opening: commands sent first; no answer is expected.
         request_is_acknowledged: the instrument acknowledges the request before it answers.
-        streams: one request makes the instrument send records until it is stopped.
-        host_acknowledges: command that acknowledges a record; None where the instrument expects none.
-        track: command that makes a tracking station follow the prism, sent again when it has stayed off target.
-        recover: sent when an acknowledged request brought no record; aborts a measurement that cannot succeed.
-        closing: sent when the port is closed on purpose.
+        streams: after one request the instrument sends records until it is stopped.
+        host_acknowledges: command that acknowledges a record; None if the instrument expects no acknowledgement.
+        track: command that makes a tracking station follow the prism; sent again if it stays off target.
+        recover: commands sent if no record follows an acknowledged request; they abort a measurement that cannot
+            succeed.
+        closing: commands sent before a regular close of the port.
         pause_after_ack_s: time that the instrument needs after a setting before the next command.
     """
 
@@ -72,7 +73,7 @@ class CommandPlan:
 
 @dataclass(slots=True)
 class _Asked:
-    """A command that waits for its answer (times in ns)."""
+    """A command that is waiting for its answer (times in ns)."""
 
     command: bytes
     is_request: bool
@@ -86,9 +87,9 @@ class Poller:
 
     Args:
         plan: the station's commands.
-        encode: frames a command.
-        reader: decodes the replies; the poller's alone.
-        timing: time-outs.
+        encode: function that frames a command.
+        reader: decoder of the replies, not shared with other users.
+        timing: timeouts.
     """
 
     def __init__(
@@ -104,13 +105,13 @@ class Poller:
         self._acknowledged: list[str] = []
         self._unanswered: set[bytes] = set()
         self._asked: _Asked | None = None
-        self._next_ns: int | None = None  # not before; None: at once
+        self._next_ns: int | None = None  # earliest time of the next command; None for at once
         self._last_byte_ns = 0
         self._off_target_since: int | None = None
         self._notices: list[tuple[EventKind, str]] = []
 
     def step(self, now_ns: int) -> bytes | None:
-        """Return bytes to send at this monotonic instant, if any; call again until there are none."""
+        """Return the bytes to send at this monotonic instant; call again until it returns None."""
         if self._outbox:
             return self._outbox.popleft()
         if self._asked is not None:
@@ -125,7 +126,7 @@ class Poller:
         return self._ask(now_ns)
 
     def wake_ns(self, now_ns: int) -> int:
-        """Return the instant at which `step` may have something to send, if nothing is received before."""
+        """Return the instant at which `step` may have something to send if nothing is received before."""
         if self._outbox:
             return now_ns
         if self._asked is None:
@@ -135,7 +136,7 @@ class Poller:
         return min(deadline, idle) if idle > now_ns else deadline
 
     def feed(self, capture: SerialCapture) -> None:
-        """Take received bytes."""
+        """Process received bytes."""
         now_ns = self._last_byte_ns = capture.stamp.monotonic_ns
         for reply in self._reader.feed(capture):
             match reply.kind:
@@ -155,20 +156,20 @@ class Poller:
                     self._answered(now_ns)
 
     def closing(self) -> list[bytes]:
-        """Return what to send before the port is closed on purpose."""
+        """Return the commands to send before a regular close of the port."""
         return [self._encode(command) for command in self._plan.closing]
 
     def take_notices(self) -> list[tuple[EventKind, str]]:
-        """Return what an operator should know and the replies alone do not say, since the last call."""
+        """Return (event kind, text) of notices for operators since the last call that the replies do not contain."""
         notices, self._notices = self._notices, []
         return notices
 
     def _has_broken_off(self) -> bool:
-        """Drop an answer that stopped half-way; True if there was one."""
-        return any(reply.kind is not ReplyKind.NOISE for reply in self._reader.flush("broken off"))
+        """Discard an incomplete answer; return True if there was one."""
+        return any(reply.kind is not ReplyKind.NOISE for reply in self._reader.flush("incomplete"))
 
     def _ask(self, now_ns: int) -> bytes:
-        """Send the next set-up command, or the one to track to a station that stays off target, or the request."""
+        """Send the next set-up command, the command to track if the station stays off target, or the request."""
         if self._setting_up and not self._commands:
             self._finish_setup()
         since = self._off_target_since
@@ -188,14 +189,14 @@ class Poller:
         self._acknowledged = []
 
     def _deadline(self, asked: _Asked) -> int:
-        """Return when to send it again."""
+        """Return when to send the command again."""
         if asked.acked is not None:
             return asked.acked + _ns(self._timing.reply_timeout_s)
         waits_for_ack = not asked.is_request or self._plan.request_is_acknowledged
         return asked.sent + _ns(self._timing.ack_timeout_s if waits_for_ack else self._timing.reply_timeout_s)
 
     def _check(self, asked: _Asked, now_ns: int) -> None:
-        """End a question whose answer broke off or stays away."""
+        """Stop waiting for an answer that is incomplete or missing."""
         if now_ns - self._last_byte_ns >= _IDLE_NS and self._has_broken_off():
             self._answered(now_ns)
         elif asked.acked is not None and now_ns >= self._deadline(asked):
@@ -209,11 +210,11 @@ class Poller:
             self._unanswered.add(asked.command)
             text = (
                 f"station did not answer {_name(asked.command)} within {self._timing.give_up_s:g} s: check that it "
-                "is on and set to this baud rate, parity and line end"
+                "is on and set to the configured baud rate, parity and line end"
             )
             self._notices.append((EventKind.INSTRUMENT_ERROR, text))
         self._asked = None
-        if asked.is_request:  # it may have been switched off and have lost its settings
+        if asked.is_request:  # the station may have been switched off and have lost its settings
             self._commands.extend(self._plan.setup)
             self._setting_up = bool(self._plan.setup)
 
@@ -231,7 +232,7 @@ class Poller:
         self._next_ns = now_ns + _ns(self._plan.pause_after_ack_s)
 
     def _refused(self, now_ns: int) -> None:
-        """NAK: a setting that the instrument does not take is passed over; a request is repeated in its time."""
+        """Process a NAK: skip a setting that the instrument refuses; a request is repeated after its timeout."""
         if self._asked is not None and not self._asked.is_request:
             self._asked = None
             self._next_ns = now_ns + _ns(self._plan.pause_after_ack_s)

@@ -1,6 +1,6 @@
-"""Station profile: all that rigcal must know of a kind of instrument, in one object.
+"""Station profile: everything that rigcal must know about a kind of instrument, in one object.
 
-A new instrument is one new file in `drivers/stations/profiles`, with its `PROFILE`.
+To add an instrument, add a file with a `PROFILE` to `drivers/stations/profiles`.
 """
 
 from __future__ import annotations
@@ -20,13 +20,12 @@ class ProfileOptions(Settings):
     """Options of a station that its profile reads.
 
     Attributes:
-        init: further commands of the set-up, without check sums: `ZB4+`, `ZB52`, `ZB61` (circle clockwise, compensator
-            on, zenith 0) for topcon_gts8, `Xe` (tracking) for sokkia_set. Each must be one that the station
-            acknowledges.
-        crlf: commands end with CR LF after ETX (Topcon), or CR LF rather than CR (Sokkia).
-        measure: what topcon_classic asks for.
+        init: further set-up commands, without checksums: `ZB4+`, `ZB52`, `ZB61` (circle clockwise, compensator on,
+            zenith 0) for topcon_gts8, `Xe` (tracking) for sokkia_set. The station must acknowledge each of them.
+        crlf: commands end with CR LF after ETX (Topcon), or with CR LF instead of CR (Sokkia).
+        measure: quantity that topcon_classic requests.
         ppm_scale: ppm per count of the atmospheric correction, see `drivers.stations.topcon.records.CorrectionScales`.
-        prism_scale_mm: mm per count of the prism constant, see there.
+        prism_scale_mm: mm per count of the prism constant, see `CorrectionScales`.
     """
 
     init: tuple[str, ...] = ()
@@ -40,12 +39,12 @@ class ProfileOptions(Settings):
     def _printable(cls, commands: tuple[str, ...]) -> tuple[str, ...]:
         for command in commands:
             if not (command and command.isascii() and command.isprintable()):
-                raise ValueError(f"{command!r} is no command: give printable ASCII without check sum and line end")
+                raise ValueError(f"{command!r} is not a command: give printable ASCII without checksum and line end")
         return commands
 
     @property
     def init_commands(self) -> tuple[bytes, ...]:
-        """The commands of `init` as they are sent, but for framing."""
+        """The commands of `init` as bytes, without framing."""
         return tuple(command.encode("ascii") for command in self.init)
 
 
@@ -54,11 +53,11 @@ class Codec:
     """The protocol of a family of instruments.
 
     Attributes:
-        family: its name, as `listen_to` gives it.
-        encode: frames a command; the second argument says whether it ends with CR LF.
-        framer: makes a framer.
-        parser: makes a parser of the station of a name.
-        shortest_record: bytes; garbage of at least so many was meant as an answer.
+        family: name of the family, for `listen_to`.
+        encode: function that frames a command; if its second argument is True, the command ends with CR LF.
+        framer: function that creates a framer.
+        parser: function that creates a parser for the station of a given name.
+        shortest_record: length in bytes; garbage of at least this length counts as a damaged answer.
     """
 
     family: str
@@ -73,11 +72,11 @@ class StationProfile:
     """A kind of station.
 
     Attributes:
-        name: as the configuration gives it.
-        codec: its protocol; None: that of the family which `listen_to` names.
-        plan: makes the commands and pauses from the station's options; None: nothing is sent, ever.
-        untold_tracking: the set-up command after which the station follows its prism, where its records say nothing
-            of its lock; None: no such command.
+        name: name in the configuration.
+        codec: its protocol; None to use the protocol of the family given by `listen_to`.
+        plan: function that creates the commands and pauses from the station's options; None to never send anything.
+        untold_tracking: set-up command after which the station tracks its prism, if its records do not contain its lock
+            state; None if there is no such command.
     """
 
     name: str

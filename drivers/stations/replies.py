@@ -1,8 +1,8 @@
-"""Replies of a total station: captured bytes, cut into frames, timed and parsed.
+"""Replies of a total station: captured bytes, split into frames, timed and parsed.
 
-A station's bytes are decoded by one piece of code, `ReplyReader`, with a framer and a parser of the station's protocol.
-The link and the decoder have a reader each: the link must know at once what to send next, while records are decoded
-only after the bytes are stored, and can be decoded again from them at any time.
+`ReplyReader` decodes a station's bytes with a framer and a parser of the station's protocol. The link and the decoder
+have one reader each: the link must know at once what to send next, while records are decoded only after the bytes are
+stored, and can be decoded from them again at any time.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ NAK = b"\x15"
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """A complete frame whose checksum, if its protocol has one, is right.
+    """A complete frame whose checksum, if its protocol has one, is correct.
 
     Attributes:
-        data: what the frame carries, without checksum and terminator.
+        data: content of the frame, without checksum and terminator.
         start: offset of its first byte in the stream.
         end: offset of its last byte in the stream.
     """
@@ -38,7 +38,7 @@ class Frame:
 
 @dataclass(frozen=True, slots=True)
 class Garbage:
-    """Bytes that are no frame.
+    """Bytes that are not a frame.
 
     Attributes:
         raw: the bytes.
@@ -54,9 +54,9 @@ class Garbage:
 
 
 class Framer:
-    """Base of the framers, which cut a stream into frames.
+    """Base of the framers, which split a stream into frames.
 
-    A framer holds a bounded number of bytes, never raises, and loses no byte but line ends.
+    A framer holds a limited number of bytes, never raises, and drops no bytes except line ends.
     """
 
     def __init__(self) -> None:
@@ -69,15 +69,15 @@ class Framer:
         return len(self._buffer)
 
     def feed(self, data: bytes) -> Sequence[Frame | Garbage]:
-        """Return the frames and the garbage that these bytes complete, in order."""
+        """Return the frames and the garbage that `data` completes, in order."""
         raise NotImplementedError
 
     def flush(self, reason: str) -> Sequence[Garbage]:
-        """Give up an unfinished frame."""
+        """Discard an unfinished frame and return it as garbage."""
         return [self._give_up(len(self._buffer), reason)] if self._buffer else []
 
     def _give_up(self, count: int, reason: str) -> Garbage:
-        """Drop the first `count` bytes as garbage."""
+        """Remove the first `count` bytes and return them as garbage."""
         garbage = Garbage(bytes(self._buffer[:count]), reason, self._start, self._start + count - 1)
         self._drop(count)
         return garbage
@@ -93,9 +93,9 @@ class ReplyKind(Enum):
     ACK = auto()
     NAK = auto()
     RECORD = auto()
-    RECORD_OFF_TARGET = auto()  # of a tracking station that is not locked on a prism
-    UNUSABLE = auto()  # meant as the answer, but no sound record
-    NOISE = auto()  # too short to have been meant as an answer
+    RECORD_OFF_TARGET = auto()  # from a tracking station that is not locked on a prism
+    UNUSABLE = auto()  # long enough for an answer, but not a valid record
+    NOISE = auto()  # too short for an answer
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,8 +103,8 @@ class Reply:
     """A decoded reply.
 
     Attributes:
-        kind: what it means to the poller.
-        records: what it means to everybody else.
+        kind: meaning of the reply for the poller.
+        records: the decoded records, for all other users.
     """
 
     kind: ReplyKind
@@ -112,30 +112,35 @@ class Reply:
 
 
 class Parser(Protocol):
-    """Parses the frames of one station. Remembers only which errors and warnings it has reported."""
+    """Parses the frames of one station. Its only state is which errors and warnings it has reported."""
 
     def parse(self, data: bytes, first_byte: Stamp, last_byte: Stamp) -> Reply:
         """Parse the data of one frame that is neither ACK nor NAK.
 
+        Args:
+            data: data of the frame, without checksum and terminator.
+            first_byte: when its first byte arrived.
+            last_byte: when its last byte arrived.
+
         Raises:
-            RecordError: they are no known record.
+            RecordError: the data is not a known record.
         """
 
 
 def instrument_error(station: str, stamp: Stamp, text: str, code: int | None = None) -> DeviceEvent:
-    """Return the event of an error that the instrument reports."""
+    """Return the event for an error that the instrument reports."""
     return DeviceEvent(station, stamp, EventKind.INSTRUMENT_ERROR, text, code)
 
 
 class ByteTimes:
-    """Arrival times of the last bytes of a stream, on a line that sends a record's characters back to back.
+    """Arrival times of the last bytes of a stream, on a line that sends a record's characters without pauses.
 
-    A read returns several bytes at once and is stamped when the last had arrived. Byte k of n arrived n - 1 - k
-    characters earlier (10 bits each at 8N1 and 7E1), but not before the capture that came before it on the line.
+    A read returns several bytes at once and is stamped when the last one had arrived. Byte k of n arrived n - 1 - k
+    characters earlier (10 bits each at 8N1 and 7E1), but not before the previous capture on the line.
 
     Args:
-        character_s: how long one character takes, with start, parity and stop bits.
-        keep: how many of the last bytes can be asked for, at least.
+        character_s: duration of one character in seconds, including start, parity and stop bits.
+        keep: minimum number of last bytes whose times are kept.
     """
 
     def __init__(self, character_s: float, keep: int = 1024) -> None:
@@ -146,7 +151,7 @@ class ByteTimes:
         self._previous: Stamp | None = None
 
     def received(self, count: int, stamp: Stamp) -> None:
-        """Note `count` more bytes, the last of which had arrived at `stamp`."""
+        """Record the arrival of `count` more bytes, the last of them at `stamp`."""
         self._chunks.append((self._count, count, stamp, self._previous))
         self._count += count
         self._previous = stamp
@@ -154,11 +159,11 @@ class ByteTimes:
             self._chunks.popleft()
 
     def sent(self, stamp: Stamp) -> None:
-        """Note that something was sent at `stamp`: what is received next arrives later."""
+        """Record that bytes were sent at `stamp`; bytes received next cannot have arrived before."""
         self._previous = stamp
 
     def at(self, offset: int) -> Stamp:
-        """Return when the byte at `offset` of the received stream arrived (the oldest kept, for an older one)."""
+        """Return when the byte at `offset` in the received stream arrived (for older bytes, the oldest time kept)."""
         chunk = next((c for c in reversed(self._chunks) if c[0] <= offset), self._chunks[0])
         start, count, stamp, not_before = chunk
         shift = -round((count - 1 - max(0, offset - start)) * self._byte_ns)
@@ -172,10 +177,10 @@ class ReplyReader:
 
     Args:
         station: name of the station.
-        framer: a fresh framer.
-        parser: a fresh parser.
-        shortest_record: bytes; garbage of at least so many was meant as an answer.
-        character_s: how long one character takes on the line.
+        framer: a new framer.
+        parser: a new parser.
+        shortest_record: length in bytes; garbage of at least this length counts as a damaged answer.
+        character_s: duration of one character on the line in seconds.
     """
 
     def __init__(self, station: str, framer: Framer, parser: Parser, shortest_record: int, character_s: float) -> None:
@@ -194,7 +199,7 @@ class ReplyReader:
         return [self._reply(item) for item in self._framer.feed(capture.data)]
 
     def flush(self, reason: str) -> list[Reply]:
-        """Give up a reply that stopped half-way, for a reason that says so."""
+        """Discard an incomplete reply; `reason` goes into its DecodeFailure."""
         return [self._reply(garbage) for garbage in self._framer.flush(reason)]
 
     def _reply(self, item: Frame | Garbage) -> Reply:

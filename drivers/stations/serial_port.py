@@ -1,4 +1,4 @@
-"""Adapter of pyserial: every failure of a port becomes a LinkError that says what to do."""
+"""Wrapper of pyserial: every failure of a port becomes a LinkError that states what to do."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from drivers.settings import Settings
 
 _PARITY = {"none": serial.PARITY_NONE, "even": serial.PARITY_EVEN, "odd": serial.PARITY_ODD}
 
-# What pyserial lets through. flush and tcsetattr raise termios.error, which is no OSError; a port closed or unplugged
-# under a call raises TypeError or ValueError (its descriptor is None or -1).
+# Exceptions that escape from pyserial. flush and tcsetattr raise termios.error, which is not an OSError; a port that is
+# closed or unplugged during a call raises TypeError or ValueError (its descriptor is None or -1).
 _FAILURES = (serial.SerialException, OSError, termios.error, ValueError, TypeError)
 
 
@@ -30,8 +30,8 @@ class SerialConfig(Settings):
     """Settings of a serial port.
 
     Attributes:
-        path: device, best a udev link that names the adapter (`/dev/rigcal-station`).
-        baud: bit/s, as the instrument is set.
+        path: device, preferably a udev link that names the adapter (`/dev/rigcal-station`).
+        baud: baud rate in bit/s, the same as set on the instrument.
         bytesize: 7 or 8 data bits.
         parity: `none`, `even` or `odd`.
         stopbits: 1 or 2.
@@ -50,19 +50,19 @@ class SerialConfig(Settings):
 
 
 class SerialPort:
-    """An open serial port, for one thread: the one that reads also writes and closes.
+    """An open serial port, for use by one thread: the thread that reads also writes and closes.
 
-    Opening discards what the port had received before, as nothing tells when that was. The port is locked against
-    other programs by flock and TIOCEXCL. A pseudo-terminal carries eight bits and has neither parity nor stop bits
-    (Linux answers EINVAL to other settings), so there these settings are passed over.
+    Opening discards data that the port received before, because its time is unknown. The port is locked against other
+    programs by flock and TIOCEXCL. A pseudo-terminal always has eight bits and neither parity nor stop bits (Linux
+    answers EINVAL to other settings), so these settings are ignored for one.
 
     Args:
-        config: how to open it.
-        link: name of the link, for messages.
-        write_timeout_s: real seconds after which a write that the device does not take fails.
+        config: settings of the port.
+        link: name of the link, for error messages.
+        write_timeout_s: real seconds after which a write fails if the device does not accept the data.
 
     Raises:
-        LinkError: it cannot be opened.
+        LinkError: the port cannot be opened.
     """
 
     def __init__(self, config: SerialConfig, link: str, write_timeout_s: float = 5.0) -> None:
@@ -87,30 +87,30 @@ class SerialPort:
                 forbid_other_openers(self._port.fileno())
 
     def fileno(self) -> int:
-        """Return its descriptor, which does not block."""
+        """Return the port's non-blocking descriptor."""
         return int(self._port.fileno())
 
     def read(self, timeout_s: float) -> bytes:
-        """Return the received bytes; wait up to `timeout_s` real seconds for the first. Empty when none came.
+        """Return the received bytes; wait up to `timeout_s` real seconds for the first. Empty after the timeout.
 
         Raises:
-            LinkError: the device is gone.
+            LinkError: the device was lost.
         """
         with self._failing("reading failed"):
             ready, _, _ = select.select([self._port.fileno()], [], [], timeout_s)
             return self._port.read(max(1, self._port.in_waiting)) if ready else b""
 
     def write(self, data: bytes) -> None:
-        """Hand all of `data` to the device.
+        """Write all of `data` to the device.
 
         Raises:
-            LinkError: the device is gone, or did not take the bytes in time.
+            LinkError: the device was lost, or did not accept the bytes in time.
         """
         with self._failing("writing failed"):
             self._port.write(data)
 
     def close(self) -> None:
-        """Close the port; does nothing when it is closed. Only the thread that reads may call this."""
+        """Close the port; does nothing if it is closed. Only the thread that reads may call this."""
         with self._failing("closing failed"):
             self._port.close()
 
@@ -125,14 +125,14 @@ class SerialPort:
 
 
 def is_pseudo_terminal(path: str) -> bool:
-    """Return True if `path`, links followed, is the slave of a Linux pseudo-terminal."""
+    """Return True if `path`, after following links, is the slave of a Linux pseudo-terminal."""
     return os.path.realpath(path).startswith("/dev/pts/")
 
 
 def forbid_other_openers(descriptor: int) -> None:
     """Make further open() calls on the terminal fail with EBUSY (root excepted) until its last descriptor is closed.
 
-    Not for pseudo-terminals: theirs lives on in the master, and a killed process would leave it locked.
+    Do not use it on pseudo-terminals: the master keeps the lock, so a killed process would leave the terminal locked.
     """
     fcntl.ioctl(descriptor, termios.TIOCEXCL)
 
@@ -141,18 +141,18 @@ def _why_not_opened(error: Exception, config: SerialConfig) -> str:
     code = getattr(error, "errno", None)
     match code:
         case errno.ENOENT | errno.ENXIO | errno.ENODEV | errno.EIO:
-            return "no such port: plug the adapter in, or correct the path"
+            return "no such port: plug in the adapter, or correct the path"
         case errno.EACCES | errno.EPERM:
             return "permission denied: add this user to group dialout and log in again"
         case errno.EBUSY | errno.EAGAIN:
             holder = _holder(config.path)
             return f"in use by {holder}: stop it" if holder else "in use by another program: stop that program"
     settings = f"{config.baud} baud, {config.bytesize} data bits, parity {config.parity}, {config.stopbits} stop bits"
-    return f"is no serial port, or does not take {settings} ({error}): correct the path or the settings"
+    return f"not a serial port, or {settings} not supported ({error}): correct the path or the settings"
 
 
 def _holder(path: str) -> str:
-    """Return the process that has `path` open, as far as this user may see it; empty if none is seen."""
+    """Return the process that has `path` open; empty if this user can see none."""
     device = os.path.realpath(path)
     for entry in glob.iglob("/proc/[0-9]*/fd/*"):
         try:
@@ -161,5 +161,5 @@ def _holder(path: str) -> str:
                 name = Path("/proc", process, "comm").read_text(encoding="utf-8", errors="replace").strip()
                 return f"process {process} ({name})"
         except OSError:
-            continue  # it ended meanwhile, or is another user's
+            continue  # the process has ended or belongs to a different user
     return ""

@@ -1,4 +1,4 @@
-"""Columns of tables: what a header's names say of them, and which of them are read."""
+"""Columns of tables: their roles according to the names in the header, and the choice of columns to read."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ _NAMES: Mapping[Role, str] = {
 _SYNONYMS: Mapping[Role, frozenset[str]] = {role: frozenset(words.split()) for role, words in _NAMES.items()}
 CARTESIAN: tuple[Role, ...] = ("x", "y", "z")
 POLAR: tuple[Role, ...] = ("hz", "zenith", "distance")
-_OF_AXES = re.compile(r"[xyz]|[xyz](coordinate|actual|measured)|(actual|measured)[xyz]")  # names that say no direction
+_OF_AXES = re.compile(r"[xyz]|[xyz](coordinate|actual|measured)|(actual|measured)[xyz]")  # names without a direction
 
 
 def roles_of_cells(cells: list[str]) -> dict[Role, list[str]]:
-    """Return the cells of a header that may have each role: by their names, and coordinates by remarks on them too.
+    """Return role -> cells of a header that may have it, by their names and for measured columns also by remarks.
 
-    A remark that is a letter says nothing beside a name that says a direction: `Hochwert (X)` is north.
+    A remark that is a single letter is ignored if the name gives a direction: `Hochwert (X)` is north.
     """
     roles: dict[Role, list[str]] = {}
     for cell in cells:
@@ -61,10 +61,16 @@ def _roles_of(name: str) -> list[Role]:
 
 
 def one_of_each(found: dict[Role, list[str]], header_line: int, source: str, notes: list[str]) -> dict[Role, str]:
-    """Return the column of each role, coordinates before angles, and add to the notes which of two is taken.
+    """Return the column of each role, preferring coordinates to angles.
+
+    Args:
+        found: role -> columns that may have it.
+        header_line: line number of the header.
+        source: name of the file, for error messages.
+        notes: a note is added for each role with several possible columns.
 
     Raises:
-        DescriptionError: a second column may be a coordinate, an angle or a distance, or nothing says which of X and Y
+        DescriptionError: two columns may be the same coordinate, angle or distance, or it is unknown which of X and Y
             is east.
     """
     left_out = POLAR if found.keys() >= set(CARTESIAN) else CARTESIAN
@@ -74,23 +80,23 @@ def one_of_each(found: dict[Role, list[str]], header_line: int, source: str, not
             continue
         if len(cells) > 1 and role in (*CARTESIAN, *POLAR):
             said = " and ".join(map(repr, cells))
-            todo = f"rename one, or write a map that names the right one ({role} in [columns]) and give it with --map"
+            todo = f"rename one, or write a map with the right one ({role} in [columns]) and pass it with --map"
             refuse(source, f"columns {said} may both be {role}; {todo}", header_line)
         roles[role] = cells[0]
         if len(cells) > 1:
-            notes.append(f"{role} by {cells[0]!r} alone, though columns {', '.join(cells)} may be it")
+            notes.append(f"{role} is read from {cells[0]!r}, although columns {', '.join(cells)} are possible")
     _check_axes(list(roles), [roles[role] for role in ("x", "y") if role in roles], header_line, source)
     return roles
 
 
 def _check_axes(order: Sequence[Role], columns: Sequence[str], header_line: int, source: str) -> None:
-    """Refuse a column Y before X, as grids have it whose X is north, where no name or remark says which is east."""
+    """Refuse a column Y before X, the order of grids whose X is north, if no name or remark shows which is east."""
     if "x" not in order or order.index("x") < order.index("y"):
         return
     remarks = [_plain(remark) for column in columns for remark in bracket_words(column)]
     is_said = any(set(_roles_of(remark)) & {"x", "y"} and remark not in ("x", "y") for remark in remarks)
     if not is_said and all(_OF_AXES.fullmatch(_plain(without_unit(column))) for column in columns):
         x, y = columns
-        said = f"{y!r} stands before {x!r}, as in grids whose X is north, and nothing says which is east"
-        todo = f'write a map that says it in [columns] (x = "{y}", y = "{x}" for such a grid) and give it with --map'
-        refuse(source, f"{said}; call them East and North, or {todo}", header_line)
+        said = f"{y!r} is before {x!r}, as in grids whose X is north, and it is not stated which is east"
+        todo = f'write a map that states it in [columns] (x = "{y}", y = "{x}" for such a grid) and pass it with --map'
+        refuse(source, f"{said}; rename them to East and North, or {todo}", header_line)

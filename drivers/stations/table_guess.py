@@ -1,4 +1,4 @@
-"""Tables of text: their separator, header, units and columns are guessed."""
+"""Guessing the separator, header, units and columns of text tables."""
 
 from __future__ import annotations
 
@@ -13,21 +13,22 @@ from drivers.stations.table_columns import CARTESIAN, POLAR, one_of_each, roles_
 from drivers.stations.units_above import unit_of_preamble
 
 _SEPARATORS = (";", "\t", ",", " ")
-_HEAD_LINES = 200  # a preamble is not longer
+_HEAD_LINES = 200  # longest preamble
 _TIME_FORMATS = ("%d.%m.%Y %H:%M:%S.%f", "%d.%m.%Y %H:%M:%S", "%m/%d/%Y %H:%M:%S.%f", "%m/%d/%Y %H:%M:%S")
 CLOCK_FORMATS = ("%H:%M:%S.%f", "%H:%M:%S")
 
 
 def guess_table(text: str, source: str, name: str) -> Guess:
-    """Guess how a table is read.
+    """Guess how to read a table.
 
     Args:
-        text: the file's.
-        source: its name, for messages.
-        name: of the format.
+        text: content of the file.
+        source: name of the file, for error messages.
+        name: name of the format.
 
     Raises:
-        DescriptionError: no line names coordinates, or angles and a distance, and none has four numbers.
+        DescriptionError: no line names coordinates, or angles and a distance, and no line has a point and three
+            numbers.
     """
     lines = lines_of(text)
     for separator in _SEPARATORS:
@@ -37,7 +38,7 @@ def guess_table(text: str, source: str, name: str) -> Guess:
                 if separator == " " and any(
                     cell[-1] in ",;" for cell in lines[number : number + 1] for cell in cell.split()
                 ):
-                    continue  # a remark that names the columns; the rows are separated otherwise
+                    continue  # a comment that names the columns; the rows use a different separator
                 return _with_header(lines, separator, number, roles, name, source)
     return _without_header(lines, source, name)
 
@@ -49,12 +50,12 @@ def _with_header(
     notes = [f"line {header} is the header; columns are separated by {_said(separator)}"]
     first = header + 1
     while first < len(lines) and not any(map(str.isdigit, lines[first - 1])):
-        first += 1  # a line of units, an empty one
+        first += 1  # a line of units or an empty line
     roles = one_of_each(found, header, source, notes)
     by_role = ", ".join(f"{role}: {cell!r}" for role, cell in roles.items())
     notes.insert(1, f"columns by their names: {by_role}")
     if "point" not in roles:
-        notes.append("no column is known to name the points, so they are 1, 2, ... in the order of the file")
+        notes.append("no column names the points, so they are numbered 1, 2, ... in the order of the file")
     sample = _sample(lines, separator, first)
 
     def sampled(of: list[str]) -> list[str]:
@@ -88,11 +89,11 @@ def _with_header(
         if named is None:
             largest = _largest(sampled(of), decimal)
             given[key] = by_size(largest)
-            greatest = f"{largest:g} is the greatest number, so {given[key]} is taken"
-            notes.append(f"no unit of {quantity.name} is named that is known; {greatest}")
+            greatest = f"the largest number is {largest:g}, so {given[key]} is assumed"
+            notes.append(f"the file gives no known unit of {quantity.name}; {greatest}")
         else:
             given[key] = named[0]
-            notes.append(f"the unit of {quantity.name} is {named[0]}, as {named[1]} says")
+            notes.append(f"the unit of {quantity.name} is {named[0]}, according to {named[1]}")
     map_ = ColumnMap.model_validate(
         {
             "format": name,
@@ -109,7 +110,7 @@ def _with_header(
 
 
 def _sample(lines: list[str], separator: str, first: int) -> list[list[str]]:
-    """Return the cells of some rows from a line on."""
+    """Return the cells of up to 201 rows from line `first` on."""
     return [cells_of(line, separator) for line in lines[first - 1 : first + 200] if not is_no_row(line, separator)]
 
 
@@ -143,37 +144,37 @@ def _without_header(lines: list[str], source: str, name: str) -> Guess:
                 largest = _largest(coordinates, decimal)
                 named = unit_of_preamble(LENGTHS, lines[: number - 1], source)
                 length = named[0] if named else _length_by_size(largest)
-                why = f"{named[1]} says" if named else f"{largest:g} is the greatest coordinate"
+                why = f"according to {named[1]}" if named else f"as the largest coordinate is {largest:g}"
                 notes = (
                     f"no header; from line {number} on: point, x, y, z, separated by {_said(separator)}",
                     *_decimal_note(coordinates),
-                    f"the unit of length is {length}, as {why}",
+                    f"the unit of length is {length}, {why}",
                 )
                 columns = {"point": 1, "x": 2, "y": 3, "z": 4}
                 given = {"format": name, "separator": separator, "decimal": decimal, "first_line": number}
                 return Guess(ColumnMap.model_validate({**given, "length_unit": length, "columns": columns}), notes)
     refuse(
         source,
-        "no line names columns x, y, z (or hz, v and a slope distance), none begins with a point and three numbers; "
-        "write a map and give it with --map",
+        "no line names columns x, y, z (or hz, v and a slope distance) or begins with a point and three numbers; "
+        "write a map and pass it with --map",
     )
 
 
 def _check_without_header(lines: list[str], separator: str, first: int, source: str) -> None:
-    """Refuse a header that is not known, a damaged row, and commas that are separator and decimal sign in one."""
+    """Refuse an unknown header, a damaged row, and commas used both as separators and as decimal signs."""
     cells = cells_of(lines[first - 1], separator)
     for number, line in enumerate(lines[: first - 1], 1):
         before = cells_of(line, separator)
         numbers = sum(number_of(cell, ",") is not None for cell in before)
-        # Rows with a separator at their end have a cell more than their header
+        # Rows with a separator at their end have one cell more than their header
         is_as_wide = len(before) == len(cells) or (separator != " " and sum(map(bool, before)) >= 4)
         if is_as_wide and any(before[1:]) and not numbers:
-            said = f"its names are not known ({', '.join(before)})"
-            advice = "call the columns point, x, y and z in it, or delete it if it is a remark"
-            refuse(source, f"this is a header, and {said}; {advice}", number)
+            said = f"its names are unknown ({', '.join(before)})"
+            advice = "name the columns point, x, y and z, or delete the line if it is a comment"
+            refuse(source, f"this line looks like a header, but {said}; {advice}", number)
         if numbers > (0 if len(before) == len(cells) else 1):
-            said = f"it has numbers, as the points from line {first} on, but is no point, x, y, z"
-            refuse(source, f"{said}; mend it, or delete it if it is a remark", number)
+            said = f"the line has numbers like the points from line {first} on, but is not point, x, y, z"
+            refuse(source, f"{said}; correct it, or delete it if it is a comment", number)
     if separator == "," and len(cells) >= 7 and all(map(WHOLE.fullmatch, cells[1:7])):
         refuse(source, why_too_many(cells, 4, separator), first)
 
@@ -193,7 +194,7 @@ def _time_format(sample: list[list[str]], header: list[str], roles: dict[Role, s
 
 
 def _said(separator: str) -> str:
-    return {";": "semicolons", "\t": "tabulators", ",": "commas", " ": "blanks"}[separator]
+    return {";": "semicolons", "\t": "tabs", ",": "commas", " ": "blanks"}[separator]
 
 
 def _time_text(cells: list[str], header: list[str], roles: Mapping[Role, str]) -> str:

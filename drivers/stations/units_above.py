@@ -1,4 +1,4 @@
-"""Units that the lines above a table name."""
+"""Units given in the lines above a table."""
 
 from __future__ import annotations
 
@@ -19,23 +19,28 @@ _FILLERS = frozenset(_BESIDE_UNITS.split())
 _OF_ANYTHING = "all the of used measure measurement export file height heights default project job"
 _OF_ALL = frozenset(_OF_ANYTHING.split())
 _PHRASE_ENDS = re.compile(r"[:=;,\t()\[\]\"]|/(?!s\b)|\band\b")
-_LINE_MAX = 400  # characters of a line that says something
+_LINE_MAX = 400  # characters of a line that are searched
 _BEFORE_M = frozenset(("in", "unit", "units", "is", "are", "einheit", "einheiten"))
 
 
 def unit_of_preamble(quantity: Quantity, lines: Sequence[str], source: str) -> tuple[str, str] | None:
-    """Return the unit that the lines above a table name, and the word and line that say it.
+    """Return (unit, its word and line) from the lines above a table; None if they give no unit.
+
+    Args:
+        quantity: quantity of the unit.
+        lines: the lines above the table.
+        source: name of the file, for error messages.
 
     Raises:
-        DescriptionError: they name two, or one that is not known.
+        DescriptionError: the lines give two different units or an unknown unit.
     """
     units: dict[str, str] = {}
     for number, line in enumerate(lines, 1):
         plain = line[:_LINE_MAX].lower()
         unknown = next(_unknown_words(quantity, plain), None)
         if unknown is not None:
-            todo = f"export {quantity.known_units()}, or name the unit in the header, as in 'X [mm]'"
-            refuse(source, f"{unknown!r} is no unit of {quantity.name} that is known; {todo}", number)
+            todo = f"export {quantity.known_units()}, or give the unit in the header, as in 'X [mm]'"
+            refuse(source, f"{unknown!r} is not a known unit of {quantity.name}; {todo}", number)
         for word in _unit_words(quantity, plain):
             if word in quantity.words:
                 units.setdefault(quantity.words[word], f"{word!r} in line {number}")
@@ -43,16 +48,16 @@ def unit_of_preamble(quantity: Quantity, lines: Sequence[str], source: str) -> t
         different = " and ".join(f"{where} ({unit})" for unit, where in units.items())
         refuse(
             source,
-            f"the lines above the table name different units of {quantity.name}: {different}; leave one, or name "
+            f"the lines above the table give different units of {quantity.name}: {different}; keep one, or give "
             f"the unit in the header, as in 'X [mm]'",
         )
     return next(iter(units.items()), None)
 
 
 def _unknown_words(quantity: Quantity, line: str) -> Iterator[str]:
-    """Yield what a line says of a quantity's unit and is no unit that is known.
+    """Yield the words with which a line gives an unsupported unit for a quantity.
 
-    This is a word after `units:` that names none, or a unit that is known to be another one, as `US survey feet`.
+    Such a word is an unknown word after `units:`, or a known unit that is not supported, such as `US survey feet`.
     """
     other = ANGLES if quantity is LENGTHS else LENGTHS
     for found in _UNIT_WORD.finditer(line):
@@ -61,7 +66,7 @@ def _unknown_words(quantity: Quantity, line: str) -> Iterator[str]:
             continue
         of = set(re.findall(r"\w+", re.split(r"[:;=,\t]", line[: found.start()])[-1] + said["of"]))
         if not of <= _OF_ALL | quantity.subjects | other.subjects or of & other.subjects:
-            continue  # of an instrument, of temperatures
+            continue  # units of an instrument or of temperatures
         if another := quantity.others.search(said["said"]):
             yield another[0]
         words = [word.strip(".'\"()[]") for word in re.split(r"[\s,/]+", said["said"])]
@@ -75,10 +80,11 @@ def _unknown_words(quantity: Quantity, line: str) -> Iterator[str]:
 
 
 def _unit_words(quantity: Quantity, line: str) -> Iterator[str]:
-    """Yield the words of a line that may be units: all where it has that word, else those after `in`, `:` or a bracket.
+    """Yield the words of a line that may be units.
 
-    A line without the word must speak of the quantity, and of no length of its own, as `Length of the rod (mm): 1200`.
-    `in` and `m` are units where they stand alone, `m` also after `in`.
+    If the line contains the word "unit", these are all its words, else the words after `in`, `:`, `=` or a bracket. A
+    line without "unit" must refer to the quantity and must not give a value, such as `Length of the rod (mm): 1200`.
+    `in` and `m` are units if they stand alone, `m` also after words such as `in`.
     """
     if not _UNIT_WORD.search(line):
         if quantity.subjects & set(re.findall(r"\w+", line)) and not any(map(str.isdigit, line)):

@@ -1,4 +1,4 @@
-"""Scenes in which two effects are confounded: the poses and signals are chosen so that both explain the data."""
+"""Scenes in which two effects are confounded: poses and signals are chosen so that either effect explains the data."""
 
 from __future__ import annotations
 
@@ -15,33 +15,33 @@ from simulators.rig.screws import Floats
 _VISIT_H, _NEXT_VISIT_H = 0.2, 5.0
 _IDLE_BAR, _FULL_STROKE_BAR = 60.0, 250.0
 
-# True columns, and the same as recorded, of some fixes.
+# Given some fixes, returns the new true values of some of their columns.
 Change = Callable[[Fixes], Mapping[str, Floats]]
 
 
 def alias_scene(scene: Scene, families: str, rng: np.random.Generator) -> tuple[Scene, str]:
-    """Return a scene in which two effects cannot be told apart, and the place of both.
+    """Return a scene in which two effects cannot be distinguished, and the place of both.
 
     Args:
         scene: poses and noise.
         families: one of `cells.ALIASES`.
-        rng: chooses the place where there are several.
+        rng: chooses the place if there are several.
 
     Raises:
-        UnreachableError: this rig has no such place.
-        KeyError: no such pair.
+        UnreachableError: this rig has no suitable place.
+        KeyError: `families` is not a known pair.
     """
     return _MADE[families](scene, rng)
 
 
 def _two_visits(scene: Scene, rng: np.random.Generator) -> tuple[Scene, str]:
-    """Two short visits, hours apart: a drift and a step in between are the same."""
+    """Two short visits, hours apart: a drift and a step between them look the same."""
     del rng
     return _at_other_times(scene, lambda fixes: {"time_s": _visits(scene, fixes)[0]}), "base"
 
 
 def _creeping_later(scene: Scene, rng: np.random.Generator) -> tuple[Scene, str]:
-    """Two short visits, and motion in the second alone: how the clock was in the first does not show."""
+    """Two short visits with motion only in the second, so the clock's offset in the first is invisible."""
     del rng
     rates = [f"{name}_rate" for name in scene.truth.rig.joint_names]
 
@@ -53,7 +53,11 @@ def _creeping_later(scene: Scene, rng: np.random.Generator) -> tuple[Scene, str]
 
 
 def _visits(scene: Scene, fixes: Fixes) -> tuple[Floats, Floats]:
-    """(n,) instants of fixes in two visits instead of one duty cycle, s; (n,) 0 in the first and 1 in the second."""
+    """Move the fixes from one duty cycle into two visits.
+
+    Returns:
+        (n,) instants in s; (n,) 0 in the first visit and 1 in the second.
+    """
     first, last = scene.draws.first_s, scene.draws.last_s
     part = 2.0 * (fixes.columns["time_s"] - first) / (last - first)
     visit = (part >= 1.0).astype(float)
@@ -67,7 +71,7 @@ def _at_other_times(scene: Scene, change: Change) -> Scene:
 
 
 def _lowered(scene: Scene, rng: np.random.Generator) -> tuple[Scene, str]:
-    """A joint that always comes to rest in the direction of its load: friction there is as elasticity."""
+    """A joint that always comes to rest in the direction of its load: its friction looks like elasticity."""
     where = _one_of(
         [p for p in scene.draws.places("load_hysteresis") if p in scene.draws.places("joint_compliance")], rng
     )
@@ -80,9 +84,9 @@ def _lowered(scene: Scene, rng: np.random.Generator) -> tuple[Scene, str]:
 
 
 def _from_the_other_side(scene: Scene, rng: np.random.Generator) -> tuple[Scene, str]:
-    """Two short visits, and a joint that comes from below in the first and from above in the second.
+    """Two short visits, with a joint approaching from below in the first and from above in the second.
 
-    Its play is then as a zero that stepped in between.
+    The joint's play then looks like a step of its zero between the visits.
     """
     where = _one_of(
         _far_reaching(scene, set(scene.draws.places("backlash")) & set(scene.draws.places("zero_step"))), rng
@@ -98,7 +102,7 @@ def _from_the_other_side(scene: Scene, rng: np.random.Generator) -> tuple[Scene,
 
 
 def _pressed(scene: Scene, rng: np.random.Generator) -> tuple[Scene, str]:
-    """A pressure that follows the stroke: its compression of the cylinder is as a wrong scale."""
+    """A pressure that follows the stroke: the cylinder's compression looks like a wrong scale."""
     where = _one_of(list(scene.draws.places("cylinder_compression")), rng)
     stroke = max(abs(limit) for limit in scene.truth.rig.joint(where).limits)
 
@@ -118,7 +122,7 @@ _MADE: Mapping[str, Callable[[Scene, np.random.Generator], tuple[Scene, str]]] =
 
 
 def _changed(scene: Scene, change: Change) -> Scene:
-    """Replace columns, recorded with the same errors of their sensors; zero is recorded as zero."""
+    """Replace columns; recorded values keep the errors of their sensors, but zero is recorded as zero."""
     training, held_out, new = scene.training, scene.held_out, change(scene.training)
     recorded = {
         name: np.where(values == 0.0, 0.0, training.recorded[name] + values - training.columns[name])
@@ -132,7 +136,7 @@ def _changed(scene: Scene, change: Change) -> Scene:
 
 
 def _far_reaching(scene: Scene, joints: Collection[str]) -> list[str]:
-    """Return the joints that move the prism by as much as the median one, or more: play of others hardly shows."""
+    """Return the joints that move the prism at least as much as the median joint; play of others is hardly visible."""
     moved = {p: scene.displacement_mm([ZeroStep(p, time_s=-np.inf)]) for p in sorted(joints)}
     size = {p: float(np.sqrt(np.mean(mm**2))) for p, mm in moved.items()}
     return [p for p in size if size[p] >= np.median(list(size.values()))]
@@ -140,5 +144,5 @@ def _far_reaching(scene: Scene, joints: Collection[str]) -> list[str]:
 
 def _one_of(places: list[str], rng: np.random.Generator) -> str:
     if not places:
-        raise UnreachableError("this rig has no place for such a pair")
+        raise UnreachableError("this rig has no place for this pair of effects")
     return str(rng.choice(places))

@@ -1,15 +1,16 @@
-"""Separability of a hidden effect from all alternatives, by the data at hand.
+"""Separability of a hidden effect from all alternatives with the given data.
 
-The log evidence of each family of the simulator, at each of its places, for the noise-free visible displacement of the
+For each family of the simulator, at each of its places, the log evidence for the noise-free visible displacement of the
 hidden effect is
 
     ln E = 1/2 b' A^-1 b - 1/2 ln |A|,   A = I + G'G,  b = G's
 
-s is the visible displacement by the hidden effect, and G that by the family's coefficients at their hard bounds, both
-in units of the noise. The prior width is the hard bound and not the plausible size, because effects are drawn by their
-visible size. With noise, the log odds of two families scatter by the length of the difference between their fits. An
-effect is separable if it beats the nearest alternative by `MARGIN` in all but 2 % of the draws of the noise, and plain
-if in all but 0.1 %. The effect's own family at other places is no alternative: the question is the name.
+s is the visible displacement by the hidden effect, and G the visible displacement by the family's coefficients at their
+hard bounds, both in units of the noise. The prior width is the hard bound and not the plausible size, because effects
+are drawn by their visible size. With noise, the standard deviation of the log odds of two families is the norm of the
+difference between their fits. An effect is separable if it beats the nearest alternative by `MARGIN` in all but 2 % of
+the draws of the noise, and plain if it does so in all but 0.1 %. The effect's own family at other places is not an
+alternative, because only the name matters.
 """
 
 from __future__ import annotations
@@ -26,13 +27,13 @@ from simulators.effects.base import Effect
 from simulators.effects.library import LIBRARY
 from simulators.rig.screws import Floats
 
-MARGIN = 5.0  # of ln odds
-SIGMAS = 2.054  # a normal number is above minus this in 98 % of draws
-_PLAIN_SIGMAS = 3.090  # likewise in 99.9 %
-_STEP_TIMES = 9  # at which a alternative may step
-_LINEAR = 1e-2  # of a bound: small enough to be linear
-# A free curve of the angle follows any other error of that joint's angle; its many coefficients are what speaks
-# against it, and not the data. It is no alternative.
+MARGIN = 5.0  # ln odds
+SIGMAS = 2.054  # a standard normal number is above minus this in 98 % of draws
+_PLAIN_SIGMAS = 3.090  # the same for 99.9 %
+_STEP_TIMES = 9  # number of times at which an alternative may step
+_LINEAR = 1e-2  # share of a bound that is small enough for a linear response
+# A free curve of the angle can follow any other error of that joint's angle, and only its many coefficients count
+# against it, not the data. It is therefore not an alternative.
 _NO_ALTERNATIVE = ("joint_error_map",)
 
 
@@ -42,8 +43,8 @@ class Separation:
 
     Attributes:
         alternative: `family@where`; empty if the rig has no other effect.
-        log_odds: expected, of the effect's family against the alternative.
-        scatter: standard deviation of these by the noise.
+        log_odds: expected log odds of the effect's family against the alternative.
+        scatter: standard deviation of the log odds due to noise.
     """
 
     alternative: str
@@ -52,22 +53,22 @@ class Separation:
 
     @property
     def is_separable(self) -> bool:
-        """Beaten in all but 2 % of the draws of the noise."""
+        """True if the alternative is beaten in all but 2 % of the draws of the noise."""
         return self.log_odds - SIGMAS * self.scatter >= MARGIN
 
     @property
     def is_plain(self) -> bool:
-        """Beaten in all but 0.1 % of the draws of the noise."""
+        """True if the alternative is beaten in all but 0.1 % of the draws of the noise."""
         return self.log_odds - _PLAIN_SIGMAS * self.scatter >= MARGIN
 
 
 def nearest_alternative(scene: Scene, visibility: Visibility, effect: Effect) -> Separation:
-    """Find the family, other than the effect's own, that explains its visible displacement best.
+    """Find the family, other than the effect's own, that best explains the effect's visible displacement.
 
     Args:
         scene: the data.
-        visibility: what shows of it.
-        effect: the hidden one.
+        visibility: visible part of displacements in the scene.
+        effect: the hidden effect.
     """
     signal = visibility.seen(scene.displacement_mm([effect])[:, :, None])[:, 0]
     own_evidence, own_fit = weigh(effect_columns(scene, visibility, effect), signal)
@@ -89,7 +90,7 @@ def _alternatives(scene: Scene, family: str) -> Iterator[Effect]:
 
 
 def _forms(effect: Effect, scene: Scene) -> Iterator[Effect]:
-    """Yield the variants of an effect: cycles per turn, instants of a step."""
+    """Yield the variants of an effect: different cycles per turn, or different times of a step."""
     if effect.family == "encoder_harmonic":
         yield from (_changed(effect, k=k) for k in (1, 2))
     elif "time_s" in {f.name for f in fields(effect)}:
@@ -100,12 +101,23 @@ def _forms(effect: Effect, scene: Scene) -> Iterator[Effect]:
 
 
 def effect_columns(scene: Scene, visibility: Visibility, effect: Effect) -> Floats:
-    """(3 n, k) visible displacement by each coefficient of an effect at its bound; k is 0 if the data lack a column."""
+    """Return the (3 n, k) visible displacement by each coefficient of an effect at its bound.
+
+    The displacement is in units of the noise; k is 0 if the data lack a column that the effect needs.
+
+    Args:
+        scene: the data.
+        visibility: visible part of displacements in the scene.
+        effect: the effect, at its place.
+    """
     return visibility.seen(effect_columns_mm(scene, effect))
 
 
 def effect_columns_mm(scene: Scene, effect: Effect) -> Floats:
-    """(n, 3, k) displacement by each coefficient of an effect at its bound; k is 0 if the data lack a column."""
+    """Return the (n, 3, k) displacement in mm by each coefficient of an effect at its bound.
+
+    k is 0 if the data lack a column that the effect needs.
+    """
     bounds = scene.draws.bounds(effect)
     small = [{**dict.fromkeys(bounds, 0.0), name: _LINEAR * bound} for name, bound in bounds.items()]
     try:
@@ -116,7 +128,7 @@ def effect_columns_mm(scene: Scene, effect: Effect) -> Floats:
 
 
 def library_columns_mm(scene: Scene) -> list[tuple[Effect, Floats]]:
-    """Every form of every effect of the library at all its places, with its columns in mm; free curves apart."""
+    """Return each variant of each library effect at all its places, with its columns in mm; without free curves."""
     draws = scene.draws
     return [
         (form, columns_mm)
@@ -133,7 +145,12 @@ def _changed(effect: Effect, **values: Any) -> Effect:
 
 
 def weigh(columns: Floats, signal: Floats) -> tuple[float, Floats]:
-    """Log evidence, and (3 n,) the fit."""
+    """Return the log evidence and the (3 n,) fit.
+
+    Args:
+        columns: (3 n, k) visible displacement by each coefficient at its bound, in units of the noise.
+        signal: (3 n,) visible displacement to explain, in units of the noise.
+    """
     A = np.eye(columns.shape[1]) + columns.T @ columns
     b = columns.T @ signal
     found = np.linalg.solve(A, b)

@@ -1,11 +1,11 @@
 """`python -m simulators.blind.case_files`: draw cases with hidden effects, and measure further poses of them.
 
-    draw     CASE.csv, CASE-held-out.csv (readings without positions) and, where the scoring takes it, CASE-twin.csv
-             (the same machine and noise without effects); cases.json, the cases and the families that the analysis has
-             to do without; labels.json, the hidden effects of each case and all else that the scoring needs
-    measure  CASE-measured.csv: the observations of a case with further poses, of each case that a file names
+    draw     CASE.csv, CASE-held-out.csv (readings without positions) and, if the scoring needs it, CASE-twin.csv (the
+             same machine and noise without effects); cases.json, the cases and the families that the analysis may not
+             use; labels.json, the hidden effects of each case and everything else that the scoring needs
+    measure  CASE-measured.csv: the observations of a case with further poses, for each case named in a file
 
-The same options draw the same files. An analysis is given the first two files of a case, and never the labels.
+The same options draw the same files. An analysis gets the first two files of a case, and never the labels.
 """
 
 from __future__ import annotations
@@ -45,20 +45,20 @@ def _parser() -> argparse.ArgumentParser:
     add("--rig", required=True, help="a shipped rig's name or a path to a TOML file")
     add("--out", type=Path, required=True, help="directory for observations and labels")
     add("--plan", type=Path, help="measure: a JSON file, case -> rows of a pose plan")
-    add("--workers", type=int, default=os.cpu_count() or 1, help="processes that draw")
+    add("--workers", type=int, default=os.cpu_count() or 1, help="number of worker processes")
     add("--first", type=int, default=REPORTED_FROM, help="seed of the first case")
-    add("--short", action="store_true", help="a few cases of every kind")
+    add("--short", action="store_true", help="draw only a few cases of every kind")
     add("--cells", default="", help="kinds of case: KIND,...")
     add("--poses", default="", help="kinds of poses: KIND,...")
     add("--noises", default="", help="kinds of noise: KIND,...")
     add("--effects", default="", help="families of single effects: FAMILY,...")
     add("--sizes", default="", help="visible sizes of single effects: SIZE,...")
-    add("--repeats", type=int, default=1, help="cases of every cell")
+    add("--repeats", type=int, default=1, help="number of cases per cell")
     return parser
 
 
 def _cells(rig: Rig, options: argparse.Namespace) -> tuple[Cell, ...]:
-    """Cells that the options select; ValueError for an unknown name or an empty selection."""
+    """Return the cells that the options select; ValueError for an unknown name or an empty selection."""
     known = families(rig)
     kinds = _chosen("cells", options.cells, KINDS)
     poses = _chosen("poses", options.poses, POSES)
@@ -70,7 +70,7 @@ def _cells(rig: Rig, options: argparse.Namespace) -> tuple[Cell, ...]:
     outside, first = tuple(OUTSIDE), options.first
     plan = short_plan(known, outside, first) if options.short else full_plan(known, outside, first, options.repeats)
     if first < REPORTED_FROM <= plan[-1].seed:
-        raise ValueError(f"seeds from {first} run into those to report, which begin at {REPORTED_FROM}")
+        raise ValueError(f"seeds from {first} on reach the reported seeds, which begin at {REPORTED_FROM}")
     chosen = tuple(
         cell
         for cell in plan
@@ -80,15 +80,15 @@ def _cells(rig: Rig, options: argparse.Namespace) -> tuple[Cell, ...]:
         and (cell.kind != "single" or (cell.families[0] in single and cell.size in sizes))
     )
     if not chosen:
-        raise ValueError("no case is left of those options")
+        raise ValueError("the options select no case; remove some of them")
     return chosen
 
 
 def _chosen(option: str, text: str, known: Sequence[str]) -> Sequence[str]:
-    """Return the names that an option lists, or all that are known if it lists none."""
+    """Return the names that an option lists, or all known names if it lists none."""
     wanted = [part.strip() for part in text.split(",") if part.strip()]
     if unknown := [part for part in wanted if part not in known]:
-        raise ValueError(f"--{option} {unknown[0]}: known are {', '.join(known)}")
+        raise ValueError(f"--{option} {unknown[0]}: unknown; known: {', '.join(known)}")
     return wanted or known
 
 
@@ -126,7 +126,7 @@ def _measure(rig: Rig, plan: Path, directory: Path, pool: ProcessPoolExecutor) -
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Draw or measure cases; returns the exit status, 2 where there is nothing that the options ask for."""
+    """Draw or measure cases; return the exit status, 2 if the options or the files are not valid."""
     options = _parser().parse_args(arguments)
     try:
         rig = load_rig(options.rig)
@@ -143,7 +143,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _prepare_drawing() -> None:
-    """Use one core in this process, and end with the process that started it."""
+    """Use one core in this process, and exit when the parent process ends."""
     threadpool_limits(1)
     parent = multiprocessing.parent_process()
     assert parent is not None

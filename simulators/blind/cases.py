@@ -1,4 +1,4 @@
-"""Cases of the benchmark: observations, label and twin of a cell, and further poses measured."""
+"""Cases of the benchmark: observations, label and twin of a cell, and measurements of further poses."""
 
 from __future__ import annotations
 
@@ -29,44 +29,44 @@ HELD_OUT = {"wide": 150, "face": 150, "sparse": 60, "many": 150, "path": 60}
 _PLANS: Mapping[str, PosePlan] = {"wide": "wide", "face": "face", "sparse": "sparse", "many": "wide", "path": "path"}
 ENCODER_STEP_DEG = {"fine": 0.0, "stepped": 0.02, "coarse": 0.1}
 _WITH_TWIN = ("single", "pair", "triple", "machine")
-# An error of a joint's own angle is a curve of it too: where the particular family is missing, the general one is true.
-# A carrier that leans to the side that weighs on it is compliant, whatever its law.
+# An error of a joint's own angle is also a curve of the angle: if the specific family is missing, the general one is
+# true. A carrier that leans to its loaded side is compliant, whatever its law.
 _GENERAL = {
     "encoder_harmonic": ("joint_error_map",),
     "angle_scale": ("joint_error_map",),
     "base_rocking": ("base_compliance",),
     "jack_lean": ("base_compliance",),
 }
-_STEP_VARIANCE = 1.0 / 12.0  # of a reading in whole steps
+_STEP_VARIANCE = 1.0 / 12.0  # of a reading in whole steps, in squared steps
 _POSITION_COLUMNS = ("x_mm", "y_mm", "z_mm")
-# What one case in three lacks, where nothing that is hidden in it depends on it.
+# Columns of which one case in three lacks one, provided that no hidden effect of the case depends on it
 _MAY_LACK = ("temperature_degC", "dwell_s", "_rate", "_bar", "_mA")
 _LACKING = 1 / 3
-# Of a path: the error that wanders along it in units of the noise, over how many rows it forgets, and the share of the
-# cases that lack these columns.
+# Of a path: the error that wanders along it in units of the noise, its correlation length in rows, and the share of
+# cases that lack the time columns
 _PATH_WANDER, _PATH_ROWS = (0.5, 3.0), (5.0, 60.0)
 _TIMELESS, _TIMES = 0.5, ("time_s", "dwell_s")
 
 RULES = (
-    f"{POSES['wide']} poses and one prism where poses are wide, face or path, {POSES['sparse']} where they are sparse, "
-    f"{POSES['many']} where they are many",
-    "Visible size: RMS of the effect's displacement in units of the noise (station and readings), with what constants "
-    "within one build tolerance, the prism's offset and a free base can take of it taken out",
+    f"{POSES['wide']} poses and one prism if poses are wide, face or path, {POSES['sparse']} if they are sparse, "
+    f"{POSES['many']} if they are many",
+    "Visible size: RMS of the effect's displacement in units of the noise (station and readings), without the part "
+    "that constants within one build tolerance, the prism's offset and a free base can explain",
     "Amplitudes are capped at the library's hard bounds; a case that cannot reach its size anywhere is dropped",
     f"Separable, decided from the truth before any answer: the nearest family is beaten by ln odds of {MARGIN:g} in "
-    "all but 2 % of the draws of the noise; loads as the machine's own, sizes up to the hard bounds; a free curve of a "
-    "joint's angle is no alternative",
-    "A set where one family could have been named: one that is beaten so in all but 0.1 % of the draws",
-    "Right: every hidden family that the library has is named, and no other",
-    "With encoder_harmonic or angle_scale left out, joint_error_map is a true name and no misnaming: it is any curve "
-    "of the joint's own angle",
-    "Right location, of an effect outside the library: what is said of it first (the place named, the description, or "
-    "the foremost disagreement) is where it is; of the boom, also the joints at its tip",
+    "all but 2 % of the draws of the noise; loads are those of the machine, sizes go up to the hard bounds; a free "
+    "curve of a joint's angle is not an alternative",
+    "A set where one family could have been named: the nearest family is beaten in all but 0.1 % of the draws",
+    "Right: every hidden family that the library has is named, and no other family",
+    "With encoder_harmonic or angle_scale left out, joint_error_map is a true name and not a wrong one, because it is "
+    "any curve of the joint's own angle",
+    "Right location, of an effect outside the library: the first result about it (the place named, the description, or "
+    "the foremost disagreement) is at its place; for the boom, also at the joints at its tip",
     "Gap closed: (before^2 - after^2) / (before^2 - oracle^2) at held-out poses against their noise-free places; "
-    "before and after are the workflow's kinematics without and with effects, the oracle kinematics of the twin "
+    "before and after are the workflow's kinematics without and with effects, the oracle is the kinematics of the twin "
     "without effects; cases in which kinematics alone come within 2 % of the oracle are left out",
-    "Of a machine: a name at a place where it is not hidden is wrong, base_compliance beside a leaning carrier is "
-    "neither right nor wrong; the twin has the unknown structure",
+    "Of a machine: a name at a place where it is not hidden is wrong; base_compliance in addition to a leaning carrier "
+    "is neither right nor wrong; the twin has the unknown structure",
     f"Of an effect in a part of the data: a border is right within {100 * BORDER_WITHIN:g} % of its variable's range",
 )
 
@@ -76,11 +76,11 @@ class Drawn:
     """A case.
 
     Attributes:
-        train: observations CSV.
-        held_out: readings of further poses, without positions, CSV.
-        twin: observations of the same machine with the same noise and no effect, CSV; None where no score takes it.
-        without: families that the library is not to have.
-        label: hidden effects, and all else that the scoring needs.
+        train: observations as CSV.
+        held_out: readings of further poses, without positions, as CSV.
+        twin: observations of the same machine with the same noise and no effects, as CSV; None if no score needs it.
+        without: families that the analysis may not use.
+        label: hidden effects, and everything else that the scoring needs.
     """
 
     train: str
@@ -91,13 +91,13 @@ class Drawn:
 
 
 def families(rig: Rig) -> tuple[str, ...]:
-    """Families of the library that a rig has a place for."""
+    """Return the families of the library for which a rig has a place."""
     draws = draw_scene(rig, 0, SceneSettings(poses=3, held_out=1)).draws
     return tuple(name for name in LIBRARY if draws.places(name))
 
 
 def draw(rig: Rig, cell: Cell) -> Drawn | None:
-    """Draw the case of a cell; None where its effects cannot be seen so large."""
+    """Draw the case of a cell; None if its effects cannot reach the wanted visible size."""
     try:
         made = _make(rig, cell)
     except UnreachableError:
@@ -131,18 +131,18 @@ def draw(rig: Rig, cell: Cell) -> Drawn | None:
 
 
 def measured(rig: Rig, cell: Cell, poses: Sequence[Mapping[str, Any]]) -> str:
-    """Measure further poses of a case; returns all its observations, CSV.
+    """Measure further poses of a case; return all its observations as CSV.
 
     Args:
-        rig: the description.
-        cell: of the case.
-        poses: rows of a plan: a column of every joint; `<joint>_dir`, `fixes` and other columns if they matter.
+        rig: description of the rig.
+        cell: cell of the case.
+        poses: rows of a plan, with a column for every joint and optionally `<joint>_dir`, `fixes` and other columns.
 
     Raises:
-        ValueError: no pose, or one that lacks a joint.
+        ValueError: there is no pose, or a pose lacks a joint.
     """
     if missing := [j.column for j in rig.joints if not poses or any(j.column not in row for row in poses)]:
-        raise ValueError(f"no pose, or one without {missing[0]}")
+        raise ValueError(f"the plan has no pose, or a pose without {missing[0]}")
     made = _make(rig, cell)
     scene, effects = made.scene, made.effects
     joints = {j.name: np.array([float(row[j.column]) for row in poses]) for j in rig.joints}
@@ -158,11 +158,11 @@ class _Made:
     """A case before it is observed.
 
     Attributes:
-        scene: the data to be.
-        visibility: of displacements in it.
-        hidden: effects to be named or described.
-        unknown: effects that make up structure without a name, as the twin has it too.
-        regime: the part of the data in which the hidden effect acts, for the scorer; None for all.
+        scene: the scene that will be observed.
+        visibility: visible part of displacements in the scene.
+        hidden: effects that the analysis should name or describe.
+        unknown: effects that form structure without a name; the twin has them too.
+        regime: the part of the data in which the hidden effect acts, for the scorer; None for all data.
     """
 
     scene: Scene
@@ -177,7 +177,7 @@ class _Made:
 
 
 def _make(rig: Rig, cell: Cell) -> _Made:
-    """Draw a cell's scene and its hidden effects; a seed draws the same each time."""
+    """Draw a cell's scene and its hidden effects; the same seed always gives the same result."""
     rng = np.random.default_rng([cell.seed, 50])
     settings = SceneSettings(
         plan=_PLANS[cell.poses],
@@ -205,7 +205,7 @@ def _make_named(rig: Rig, cell: Cell, settings: SceneSettings, rng: np.random.Ge
 
 
 def _make_machine(rig: Rig, cell: Cell, settings: SceneSettings, rng: np.random.Generator) -> _Made:
-    """Draw a machine with many effects beside unknown structure."""
+    """Draw a machine with many effects in addition to unknown structure."""
     sizes = draw_unknown(rng)
     noise = replace(settings.noise, excess_wander=sizes.wander, wander_poses=sizes.wander_poses)
     scene = draw_scene(rig, cell.seed, replace(settings, noise=noise))
@@ -215,7 +215,7 @@ def _make_machine(rig: Rig, cell: Cell, settings: SceneSettings, rng: np.random.
 
 
 def _make_regime(rig: Rig, cell: Cell, settings: SceneSettings, rng: np.random.Generator) -> _Made:
-    """Draw a case with an effect that acts in a part of the data."""
+    """Draw a case with an effect that acts only in a part of the data."""
     scene = draw_scene(rig, cell.seed, settings)
     visibility = _visibility(scene)
     regime = draw_regime(scene, visibility, cell.size, rng)
@@ -234,14 +234,14 @@ def _make_path(rig: Rig, cell: Cell, settings: SceneSettings, rng: np.random.Gen
 
 
 def _general(made: _Made, without: Sequence[str]) -> list[str]:
-    """Families that are true of what is hidden, although it has another name or none."""
+    """Return the families that also describe the hidden effects, although these have a different name or none."""
     nameless = [h.effect.family for h in made.hidden if h.effect.family in without or h.effect.family not in LIBRARY]
     nameless += [effect.family for effect in made.unknown]
     return sorted({name for family in nameless for name in _GENERAL.get(family, ())})
 
 
 def _visibility(scene: Scene) -> Visibility:
-    """Visibility against the noise of a scene without outliers: station, readings in steps, and their instant."""
+    """Return the visibility against a scene's noise without outliers: station, resolution and timing of readings."""
     settings, fixes, rig = scene.settings.noise, scene.training, scene.truth.rig
     n = len(fixes.prism)
     sigma = {}
@@ -257,7 +257,7 @@ def _visibility(scene: Scene) -> Visibility:
 
 
 def _lacking(scene: Scene, effects: Sequence[Effect], rng: np.random.Generator) -> Scene:
-    """Remove a column from one case in three, but none on which a hidden effect depends."""
+    """Remove a column from one case in three, but never one on which a hidden effect depends."""
     name = str(rng.choice(_MAY_LACK))
     if rng.random() >= _LACKING or scene.settings.missing:
         return scene
@@ -278,7 +278,7 @@ def _effect_label(rig: Rig, hidden: HiddenEffect, without: Sequence[str]) -> dic
         "family": effect.family,
         "where": effect.where,
         "has_name": effect.family in LIBRARY and effect.family not in without,
-        # What the boom does shows where its tip is: at the joints of that row.
+        # An effect of the boom is visible at its tip, at the joints of that row
         "places": [effect.where, *(sorted(at_the_tip) if effect.where == "boom" else ())],
         "coefficients": {name: float(getattr(effect, name)) for name in effect.amplitudes},
         "scale": {name: abs(float(getattr(plausible, name))) for name in effect.amplitudes},
@@ -288,6 +288,6 @@ def _effect_label(rig: Rig, hidden: HiddenEffect, without: Sequence[str]) -> dic
 
 
 def _readings(observations: SimulatedObservations) -> str:
-    """Return observations without positions, CSV."""
+    """Return observations without positions as CSV."""
     columns = {k: v for k, v in observations.columns.items() if k not in _POSITION_COLUMNS}
     return replace(observations, columns=columns).csv_text()

@@ -37,14 +37,15 @@ class Cell:
 
     Attributes:
         kind: purpose of the case.
-        families: hidden effects; of an alias, one of `ALIASES`: two families that the data is made to confuse; of
-            `beside`, one that no library has, and one of the library; none where the seed draws them too.
-        size: visible RMS of each effect in units of the noise, the least one of a machine; 0 without effects.
+        families: hidden effects. For `alias`, one of `ALIASES`: two families that the data is designed to confuse. For
+            `beside`, one outside the library and one of the library. Empty if the seed also draws the effects.
+        size: visible RMS of each effect in units of the noise; for a machine, of its smallest effect; 0 without
+            effects.
         poses: `wide`, `face` (feed held parallel to the tunnel axis), `sparse` (few, in clusters), `many` (twice as
             many as `wide`) or `path` (one after another along a continuous path).
-        noise: encoders read in steps as the rig file has them (`fine`), of 0.02 deg (`stepped`) or 0.1 deg (`coarse`),
-            which it does not tell.
-        seed: draws everything else.
+        noise: resolution of the encoders: as in the rig file (`fine`), or 0.02 deg (`stepped`) or 0.1 deg (`coarse`),
+            which the rig file does not state.
+        seed: seed for everything else.
     """
 
     kind: Kind
@@ -59,16 +60,16 @@ def full_plan(families: Sequence[str], outside: Sequence[str], first: int, repea
     """Return the cells of the whole benchmark.
 
     Args:
-        families: of the library that the rig has a place for.
-        outside: effects that no library has.
-        first: seed of the first case; the others follow.
-        repeats: cases of every cell.
+        families: families of the library for which the rig has a place.
+        outside: effects that are not in the library.
+        first: seed of the first case; the others follow consecutively.
+        repeats: number of cases per cell.
     """
     return _numbered((cell for cell in _full(families, outside) for _ in range(repeats)), first)
 
 
 def short_plan(families: Sequence[str], outside: Sequence[str], first: int) -> tuple[Cell, ...]:
-    """Return a few cells of every kind; arguments as `full_plan`."""
+    """Return a few cells of every kind; see `full_plan` for the arguments."""
     return _numbered(_short(families, outside), first)
 
 
@@ -123,7 +124,7 @@ def _without_effect(kind: Kind, number: int) -> Iterator[_Open]:
 
 
 def _together(kind: Kind, families: Sequence[str], effects: int, number: int) -> Iterator[_Open]:
-    """Every family in turn, with partners that are farther along the list each time round."""
+    """Yield every family in turn, with partners farther along the list in each round."""
     for index in range(number):
         step = 1 + index // len(families) + index % 3
         chosen = tuple(families[(index * effects + step * i) % len(families)] for i in range(effects))
@@ -131,7 +132,7 @@ def _together(kind: Kind, families: Sequence[str], effects: int, number: int) ->
 
 
 def _beside(families: Sequence[str], outside: Sequence[str], number: int) -> Iterator[_Open]:
-    """Every effect that no library has, with families that are farther along the list each time round."""
+    """Yield every effect outside the library, with library families farther along the list in each round."""
     for index in range(number):
         turn, at = divmod(index, len(outside))
         family = families[(at * len(families) // len(outside) + turn) % len(families)]

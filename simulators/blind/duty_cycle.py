@@ -1,4 +1,4 @@
-"""Duty cycle of the boom, pose by pose: joint values, directions, rates, and the signals and temperatures meanwhile."""
+"""Duty cycle of the boom, pose by pose: joint values, directions and rates, with signals and temperatures."""
 
 from __future__ import annotations
 
@@ -18,24 +18,24 @@ from simulators.rig.truth import RigTruth
 Floats = NDArray[np.float64]
 PosePlan = Literal["wide", "face", "sparse", "path"]
 
-_FACE_SHARE = 0.45  # of a revolute joint's range, about its middle, before the feed is set parallel
+_FACE_SHARE = 0.45  # share of a revolute joint's range, about its middle, used before the feed is set parallel
 _FACE_ROUNDS = 3
-_FACE_JITTER_DEG = 0.5  # an operator sets the feed parallel by eye and by angle display
+_FACE_JITTER_DEG = 0.5  # an operator sets the feed parallel by eye and with the angle display
 _POSES_A_CLUSTER = 6
 _POSES_A_WAY_POINT = 12
-_CLUSTER_SHARE = 0.04  # of a joint's range, 1 sigma
+_CLUSTER_SHARE = 0.04  # standard deviation in a cluster, as a share of a joint's range
 
 _HOURS = 8.0  # length of a duty cycle
-_OVERSHOOT_SHARE = 0.3  # of the motions: past the pose and back
-_CREEP_RATE = 0.045  # of a joint's maximum rate, at most: 0.9 deg/s at 20
-_STILL_SHARE = 0.3  # of the joints, while others creep
-_SHORTEST_GAP = 0.4  # between poses, of the mean one; breaks make the long ones
-_DWELL_SHARES = 0.1, 0.9  # of the time since the pose before
-_RATE_OVER_S = 0.5  # readings that far apart give a rate
+_OVERSHOOT_SHARE = 0.3  # share of the motions that go past the pose and back
+_CREEP_RATE = 0.045  # largest creep rate as a share of a joint's maximum rate: 0.9 deg/s at 20
+_STILL_SHARE = 0.3  # share of the joints that stand still while others creep
+_SHORTEST_GAP = 0.4  # shortest time between poses as a share of the mean; breaks are the long gaps
+_DWELL_SHARES = 0.1, 0.9  # limits of the dwell as shares of the time since the previous pose
+_RATE_OVER_S = 0.5  # a rate is computed from readings this far apart
 _ROD_KG = 300.0
-_ROD_CHANGES = 2, 6  # in a duty cycle
+_ROD_CHANGES = 2, 6  # number in a duty cycle
 _DAY_K, _AIR_DEGC, _GUST_K = 8.0, 15.0, 0.6
-_FOLLOWING_K = 10.0  # a decoy's temperature over the duty cycle
+_FOLLOWING_K = 10.0  # rise of a decoy's temperature over the duty cycle
 _THERMOMETER_K = 0.2
 _VISIT_DWELL_S = 20.0
 _DECOY = "spare"
@@ -46,18 +46,18 @@ _BAR_PER_NEWTON = 1e-5 / 7.9e-3  # a piston of 100 mm
 
 @dataclass(frozen=True)
 class DutyCycle:
-    """n poses in the order of their times.
+    """n poses in order of time.
 
     Attributes:
         joints: joint name -> (n,) deg or mm.
-        columns: what effects may depend on, without any sensor's error -> (n,).
+        columns: name -> (n,) true value of a quantity on which effects may depend, without sensor errors.
     """
 
     joints: Mapping[str, Floats]
     columns: Mapping[str, Floats]
 
     def recorded(self, rig: Rig, rng: np.random.Generator) -> dict[str, Floats]:
-        """(n,) columns as their sensors give them, but for the readings of the joints."""
+        """Return the columns with sensor errors, name -> (n,), except the readings of the joints."""
         out: dict[str, Floats] = {}
         for name, values in self.columns.items():
             n = len(values)
@@ -87,12 +87,12 @@ def draw_duty_cycle(
     """Draw a duty cycle of n poses.
 
     Args:
-        truth: the machine; its loads make the pressures.
+        truth: the machine; its loads determine the pressures.
         n: number of poses.
         plan: see `draw_poses`.
-        rng: source.
-        moving: share of the poses that joints creep through.
-        is_decoy: the temperature follows the time, and there are signals that nothing depends on.
+        rng: random generator.
+        moving: share of the poses through which joints creep.
+        is_decoy: the temperature follows the time, and there are signals on which nothing depends.
     """
     rig = truth.rig
     joints = draw_poses(rig, plan, n, rng)
@@ -133,11 +133,11 @@ def continue_duty_cycle(
     Args:
         truth: the machine.
         poses: joint name -> (n,) deg or mm.
-        here: joint name -> where the duty cycle ended.
-        last: columns as they were then.
-        given: columns that are asked for -> (n,); the others are those of standstills a minute apart, reached straight
-            from pose to pose, with all else as at its end.
-        rng: source.
+        here: joint name -> value at the end of the duty cycle.
+        last: column name -> value at the end of the duty cycle.
+        given: column name -> (n,) requested values. Other columns describe standstills a minute apart, reached straight
+            from pose to pose, under the conditions at the end of the duty cycle.
+        rng: random generator.
     """
     rig, n = truth.rig, len(next(iter(poses.values())))
     columns: dict[str, Floats] = {
@@ -159,7 +159,7 @@ def continue_duty_cycle(
 def _machine_signals(
     truth: RigTruth, joints: Mapping[str, Floats], columns: Mapping[str, Floats], rng: np.random.Generator
 ) -> dict[str, Floats]:
-    """Pressures in the cylinders and the machine's own signals, at these joints and rates."""
+    """Return the pressures in the cylinders and the machine's own signals, at the given joints and rates."""
     rig, out = truth.rig, dict[str, Floats]()
     for joint in rig.joints:
         if joint.kind == "prismatic":
@@ -170,7 +170,7 @@ def _machine_signals(
 
 
 def _decoys(number: int, n: int, rng: np.random.Generator) -> dict[str, Floats]:
-    """Signals that nothing depends on: noise and random walks."""
+    """Return signals on which nothing depends: noise and random walks."""
     columns: dict[str, Floats] = {}
     for index in range(number):
         steps = rng.normal(0.0, 20.0, n)
@@ -182,7 +182,7 @@ def _decoys(number: int, n: int, rng: np.random.Generator) -> dict[str, Floats]:
 
 
 def _temperature(part: Floats, follows_time: bool, rng: np.random.Generator) -> Floats:
-    """(n,) of the steel, at parts of the duty cycle from 0 to 1."""
+    """Return the (n,) temperature of the steel in degC; `part` is the elapsed share of the duty cycle, 0 to 1."""
     if follows_time:
         return _AIR_DEGC + _FOLLOWING_K * part + rng.normal(0.0, _THERMOMETER_K, len(part))
     day = _DAY_K * np.sin(2.4 * part + rng.uniform(-0.3, 0.9))
@@ -191,15 +191,15 @@ def _temperature(part: Floats, follows_time: bool, rng: np.random.Generator) -> 
 
 
 def draw_poses(rig: Rig, plan: PosePlan, n: int, rng: np.random.Generator) -> dict[str, Floats]:
-    """Poses within the joint limits.
+    """Draw poses within the joint limits.
 
     Args:
-        rig: gives joints and limits.
-        plan: `wide`, evenly between the limits; `face`, the last frame's z axis (the feed) held parallel to one
-            direction as a drill plan asks, so that joints move little and make up for one another; `sparse`, a few
-            clusters of poses that are nearly the same; `path`, one after another along a smooth path.
+        rig: description with joints and limits.
+        plan: `wide`: uniformly between the limits; `face`: the last frame's z axis (the feed) held parallel to one
+            direction, as a drill plan requires, so that joints move little and compensate each other; `sparse`: a few
+            clusters of nearly equal poses; `path`: one after another along a smooth path.
         n: number of poses.
-        rng: source.
+        rng: random generator.
 
     Returns:
         Joint name -> (n,) deg or mm.
@@ -217,7 +217,7 @@ def draw_poses(rig: Rig, plan: PosePlan, n: int, rng: np.random.Generator) -> di
 
 
 def _path(rig: Rig, n: int, rng: np.random.Generator) -> dict[str, Floats]:
-    """Poses at even steps along a path through random way points; no joint goes beyond the way points' own values."""
+    """Return poses at equal steps along a path through random way points; no joint overshoots the way points."""
     way_points = max(3, 1 + -(-n // _POSES_A_WAY_POINT))
     at, steps = np.arange(float(way_points)), np.linspace(0.0, way_points - 1.0, n)
     from scipy.interpolate import PchipInterpolator
@@ -240,7 +240,7 @@ def _face(rig: Rig, n: int, rng: np.random.Generator) -> dict[str, Floats]:
         turns = _turn_axes(chain, posture, [j.name for j in turning], len(rig.rows))
         across = turns - axis[:, :, None] * (axis[:, None, :] @ turns)
         missing = np.cross(axis, feed)
-        # Every joint takes a share by its range: least squares in units of the ranges.
+        # Each joint contributes according to its range: least squares in units of the ranges
         weighted = across * span**2
         normal = weighted @ across.transpose(0, 2, 1) + 1e-6 * np.eye(3)
         step = (weighted.transpose(0, 2, 1) @ np.linalg.solve(normal, missing[:, :, None]))[:, :, 0]
@@ -253,7 +253,7 @@ def _face(rig: Rig, n: int, rng: np.random.Generator) -> dict[str, Floats]:
 
 
 def _turn_axes(chain: ScrewChain, posture: Posture, joints: list[str], frame: int) -> Floats:
-    """(n, 3, joints) by which rotation vector a frame turns per radian of each joint."""
+    """Return the (n, 3, joints) rotation vector of a frame per radian of each joint."""
     out = np.zeros((len(posture.rotations[0]), 3, len(joints)))
     for index, screw in enumerate(chain.screws):
         if screw.turns and chain.carries(index, frame):

@@ -19,13 +19,13 @@ from simulators.rig.truth import RigTruth, replace_effects
 Floats = NDArray[np.float64]
 
 _VOLUME_POSES = 256
-_ROUNDING = 1e-3  # of a bound that was read in a message
-_LEAST_LOAD = 0.05  # of the largest on any joint: less bends nothing
+_ROUNDING = 1e-3  # relative tolerance, as a bound copied from a message is rounded
+_LEAST_LOAD = 0.05  # share of the largest load on any joint; a smaller load bends nothing
 
 
 @dataclass(frozen=True)
 class Bounded:
-    """An effect at its plausible size, and the factor from there to its hard bound."""
+    """An effect at its plausible size, and the factor from this size to its hard bound."""
 
     effect: Effect
     most: float
@@ -41,10 +41,10 @@ class EffectDraws:
     """Random effects for data of one machine.
 
     Attributes:
-        rig: the description; bounds follow from its own weights.
-        prisms: that the data has.
-        first_s, last_s: when it begins and ends.
-        mean_degC: its mean temperature; effects of warmth count from it, as those of time count from `first_s`.
+        rig: description of the rig; bounds follow from its weights.
+        prisms: names of the prisms in the data.
+        first_s, last_s: start and end of the data.
+        mean_degC: mean temperature of the data; temperature effects count from it, and time effects from `first_s`.
     """
 
     rig: Rig
@@ -54,7 +54,7 @@ class EffectDraws:
     mean_degC: float  # noqa: N815 - the unit is degC
 
     def places(self, family: str) -> tuple[str, ...]:
-        """Places of an effect on the rig, empty if there are none; KeyError if there is no such family."""
+        """Return the places of a family on the rig, empty if there are none; KeyError if the family is unknown."""
         kind, rig = FAMILIES[family], self.rig
         found = []
         rows = (f"row{number}" for number in range(1, len(rig.rows) + 1))
@@ -66,11 +66,11 @@ class EffectDraws:
             if not kind.needs_load or self._carries(where):
                 found.append(where)
         if family == "prism_constant" and len(self.prisms) == 1:
-            found.remove("station")  # the same as that of the only prism
+            found.remove("station")  # identical to the effect at the only prism
         return tuple(found)
 
     def draw(self, family: str, where: str, rng: np.random.Generator) -> Bounded:
-        """Draw an effect of plausible size at a place; KeyError if there is no such family."""
+        """Draw an effect of plausible size at a place; KeyError if the family is unknown."""
         effect = FAMILIES[family](where=where).anchored(self.first_s, self.mean_degC).draw_shape(self, rng)
         size: dict[str, Any] = {name: float(getattr(effect, name)) for name in effect.amplitudes}
         if effect.has_either_sign and len(size) > 1:
@@ -84,11 +84,11 @@ class EffectDraws:
         return Bounded(effect, min(bounds[name] / abs(value) for name, value in size.items() if value != 0.0))
 
     def largest_load(self, joint: str) -> float:
-        """Largest load of the rig's own weights on a revolute joint in its work volume, N m."""
+        """Return the largest load of the rig's own weights on a revolute joint in the work volume, N m."""
         return self._loads[joint]
 
     def bounds(self, effect: Effect) -> dict[str, float]:
-        """Hard bound of each amplitude of an effect, at its place and in its direction."""
+        """Return the hard bound of each amplitude of an effect, at its place and in its direction."""
         bounds = effect.amplitudes
         if effect.bounded_at == "coefficient":
             return dict(bounds)
@@ -105,9 +105,9 @@ class EffectDraws:
         return {name: value * (bounds[name] / largest_mm) for name, value in size.items()}
 
     def limits(self, effect: Effect) -> dict[str, float]:
-        """Return the most that each amplitude of an effect may be asked to be: its hard bound, or its usual size.
+        """Return the largest permitted value of each amplitude of an effect: its hard bound or its usual size.
 
-        A joint that carries next to nothing has the bounds of one that carries a little.
+        A joint with almost no load has the bounds of a joint with a small load.
         """
         size = {name: abs(float(getattr(effect, name))) for name in effect.amplitudes}
         usual = {name: abs(float(getattr(type(effect)(where=effect.where), name))) for name in size}
@@ -118,7 +118,8 @@ class EffectDraws:
             load = _LEAST_LOAD * max(self._loads.values())
             bounds = {name: bound / load for name, bound in effect.amplitudes.items()} if load else {}
         else:
-            usual_size: dict[str, Any] = {name: value / times for name, value in size.items()}  # bounds go by direction
+            # Bounds depend on the direction
+            usual_size: dict[str, Any] = {name: value / times for name, value in size.items()}
             bounds = self.bounds(replace(effect, **usual_size))
         return {name: max(bound, usual[name]) for name, bound in bounds.items()}
 
@@ -143,7 +144,7 @@ class EffectDraws:
         }
 
     def _largest_moment(self, row: int) -> float:
-        """Largest moment of the weights that a row carries in the work volume, N m."""
+        """Return the largest moment of the weights that a row carries in the work volume, N m."""
         if row not in self._moments:
             moments = self._nominal.row_moment(row, self._volume)
             self._moments[row] = float(np.linalg.norm(moments, axis=1).max())
@@ -151,7 +152,7 @@ class EffectDraws:
 
     @cached_property
     def _moments(self) -> dict[int, float]:
-        """Row -> largest moment, of those that were asked for."""
+        """Cache: row -> largest moment."""
         return {}
 
     def _tip_mm(self, effects: Sequence[Effect]) -> Floats:
@@ -160,10 +161,10 @@ class EffectDraws:
 
 
 def require_plausible(rig: Rig, effects: Sequence[Effect]) -> None:
-    """Refuse effects beyond their hard bounds: no machine of the rig has them.
+    """Refuse effects beyond their hard bounds, which no machine of this type can have.
 
     Raises:
-        ValueError: names the coefficient and its bound.
+        ValueError: an effect is refused; the message names the coefficient and its bound.
     """
     draws = EffectDraws(rig, rig.prism_names, 0.0, 0.0, 0.0)
     for effect in effects:
@@ -172,6 +173,6 @@ def require_plausible(rig: Rig, effects: Sequence[Effect]) -> None:
             value = getattr(effect, name)
             if abs(value) > bound * (1.0 + _ROUNDING):
                 raise ValueError(
-                    f"{effect.family}@{effect.where}: {name}={value:g} is beyond {bound:.3g}, the most that such a "
-                    "machine can have"
+                    f"{effect.family}@{effect.where}: {name}={value:g} is beyond {bound:.3g}, the largest value that "
+                    "such a machine can have"
                 )

@@ -1,4 +1,4 @@
-"""Hidden effects of a chosen visible size: in a scene of the benchmark, and in a live rig."""
+"""Hiding effects of a chosen visible size in a scene of the benchmark or in a live rig."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ from simulators.rig.truth import RigTruth, replace_effects
 
 Floats = NDArray[np.float64]
 
-_CLOSE = 0.01  # of the size asked for
+_CLOSE = 0.01  # tolerance as a share of the requested size
 _TRIALS = 4
 
-# A live rig.
-SESSIONS_S = 900.0  # duration of its sessions, at least
-SIZES = (1.0, 3.0)  # visible size of its effect
+# For a live rig
+SESSIONS_S = 900.0  # minimum duration of its sessions
+SIZES = (1.0, 3.0)  # limits of the visible size of its effect
 _POSES = 60
 _DWELL_S = 3.5
-_BEYOND = ("joint_error_map",)  # it takes hundreds of poses to see
+_BEYOND = ("joint_error_map",)  # visible only with hundreds of poses
 
 
 @dataclass(frozen=True)
@@ -36,9 +36,9 @@ class HiddenEffect:
     """An effect that was hidden.
 
     Attributes:
-        effect: with its coefficients.
-        size: visible size of its displacement, as the caller measures it.
-        separable: False where the data do not tell it from another effect or place that is not hidden.
+        effect: the effect with its coefficients.
+        size: visible size of its displacement, by the caller's measure.
+        separable: False if the data cannot distinguish it from an effect or place that is not hidden.
     """
 
     effect: Effect
@@ -46,7 +46,7 @@ class HiddenEffect:
     separable: bool = True
 
     def as_dict(self) -> dict[str, Any]:
-        """As JSON."""
+        """Return the effect as a dict for JSON."""
         return {
             "family": self.effect.family,
             "where": self.effect.where,
@@ -56,7 +56,7 @@ class HiddenEffect:
 
 
 class UnreachableError(ValueError):
-    """An effect cannot be seen as large as asked for within its hard bounds, or has no place."""
+    """An effect cannot reach the requested visible size within its hard bounds, or has no place."""
 
 
 def hide(
@@ -68,20 +68,20 @@ def hide(
     *,
     where: Sequence[str | None] = (),
 ) -> tuple[HiddenEffect, ...]:
-    """Draw effects of a visible size, at places that show them.
+    """Draw effects of a given visible size, at places where they are visible.
 
     Args:
-        scene: the data to be.
-        families: of the effects; the same family twice is at two places.
-        size: of each by `visible`.
-        visible: visible size of a displacement (n, 3) of the training's fixes in mm, a number that grows with it; the
-            caller decides what calibration would absorb.
+        scene: the scene in which to hide them.
+        families: families of the effects; the same family twice gets two places.
+        size: visible size of each effect, measured by `visible`.
+        visible: function that returns the visible size of a displacement, (n, 3) in mm, of the training fixes. It must
+            grow with the displacement; the caller decides which part calibration would absorb.
         seed: the same seed draws the same effects.
-        where: fixed places, one for each family, None for a random one.
+        where: fixed place for each family; None for a random one.
 
     Raises:
-        UnreachableError: no place where the effect could be seen so large within its hard bounds.
-        KeyError: no such family.
+        UnreachableError: the effect cannot reach this visible size within its hard bounds at any place.
+        KeyError: a family is unknown.
     """
     rng = np.random.default_rng([seed, 42])
     hidden: list[HiddenEffect] = []
@@ -97,12 +97,12 @@ def hide(
                 hidden.append(found)
                 break
         else:
-            raise UnreachableError(f"{family}: nowhere is it seen at {size:g} within its hard bounds")
+            raise UnreachableError(f"{family}: it reaches size {size:g} nowhere within its hard bounds")
     return tuple(hidden)
 
 
 def _scaled_to(size: float, scene: Scene, drawn: Bounded, visible: Callable[[Floats], float]) -> HiddenEffect | None:
-    """Return the effect at the amplitude that shows as `size`; None where that is beyond its bound."""
+    """Return the effect scaled to the visible size `size`; None if that is beyond its bound."""
     factor = 1.0
     for _ in range(_TRIALS):
         effect = drawn.scaled(factor)
@@ -116,16 +116,16 @@ def _scaled_to(size: float, scene: Scene, drawn: Bounded, visible: Callable[[Flo
 
 
 def draw_hidden_effect(truth: RigTruth, rng: np.random.Generator) -> HiddenEffect:
-    """Draw an effect of a live rig that shows in a session of standing poses, within its hard bounds.
+    """Draw an effect for a live rig that is visible in a session of static poses, within its hard bounds.
 
-    Its size is the RMS of the displacement in units of a fix's noise, as `Visibility` measures it.
+    Its size is the RMS of the displacement in units of a fix's noise, measured by `Visibility`.
 
     Args:
-        truth: the machine without it.
-        rng: source.
+        truth: the machine without the effect.
+        rng: random generator.
 
     Raises:
-        ValueError: no effect shows on this rig.
+        ValueError: no effect is visible on this rig.
     """
     rig = truth.rig
     names = rig.prism_names
@@ -144,16 +144,16 @@ def draw_hidden_effect(truth: RigTruth, rng: np.random.Generator) -> HiddenEffec
             bounded = draws.draw(family, where, rng)
             try:
                 with_mm = prisms_mm(replace_effects(truth, [bounded.effect]), prism, joints, columns)
-            except ValueError:  # it needs a column that a live rig does not measure
+            except ValueError:  # the family needs a column that a live rig does not measure
                 break
             size = visible.size(with_mm - without_mm)
             if size > 0.0 and wanted / size <= bounded.most:
                 return HiddenEffect(bounded.scaled(wanted / size), wanted)
-    raise ValueError(f"no effect shows on rig {rig.name!r} within its bounds")
+    raise ValueError(f"no effect is visible on rig {rig.name!r} within its bounds")
 
 
 def _standing_columns(truth: RigTruth, rows: int, rng: np.random.Generator) -> dict[str, Floats]:
-    """Columns that effects may depend on, as in sessions of standing poses."""
+    """Return the columns on which effects may depend, with values like in sessions of static poses."""
     joints = truth.rig.joints
     columns = {f"{joint.name}_dir": rng.choice([-1.0, 1.0], rows) for joint in joints}
     columns |= {f"{joint.name}_rate": np.zeros(rows) for joint in joints}

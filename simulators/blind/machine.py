@@ -1,8 +1,8 @@
-"""Machines as they are met: ten effects of six families at once, beside smooth structure that no library names.
+"""Realistic machines: ten effects of six families at once, in addition to smooth structure that is in no library.
 
-The unknown structure is errors of joints and displacements of the last frame that pairs of joints decide, a carrier
-that leans on its jacks, and an error of the fixes that wanders. Effects are drawn so that no hidden effect is one that
-the others together imitate.
+The unknown structure consists of joint errors and displacements of the last frame that depend on pairs of joints, a
+carrier that leans on its jacks, and a wandering error of the fixes. Effects are drawn so that no hidden effect can be
+imitated by the others together.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ from simulators.effects.base import Effect
 from simulators.effects.library import LIBRARY
 from simulators.effects.unknown import JackLean, JointPairError, PlacePairError
 
-SIZES = LEAST_IN_MACHINE, 15.0  # visible size of each effect, in units of the noise
-UNKNOWN = 3.0, 8.0  # visible size of the unknown structure together, likewise
-WANDER_SHARE = 0.05, 0.2  # of the square of that, in the error that wanders
-WANDER_POSES = 10.0, 40.0  # over which it forgets
-# Places of each of six families: ten effects.
+SIZES = LEAST_IN_MACHINE, 15.0  # limits of the visible size of each effect, in units of the noise
+UNKNOWN = 3.0, 8.0  # limits of the visible size of the whole unknown structure, in units of the noise
+WANDER_SHARE = 0.05, 0.2  # share of the wandering error in the square of that size
+WANDER_POSES = 10.0, 40.0  # correlation length of the wandering error in poses
+# Number of places of each of six families, ten effects in total
 _PLACES = ((5, 1, 1, 1, 1, 1), (4, 2, 1, 1, 1, 1), (3, 3, 1, 1, 1, 1), (3, 2, 2, 1, 1, 1), (2, 2, 2, 2, 1, 1))
-_UNEVEN = 1.0  # spread of the logarithm of the softness of the jacks, about either axis
-_PAIR_ERRORS = 2, 4  # joints that err with a pair of joints, from and below
-_TRIALS = 20  # of a structure, until no effect of the library describes it, and of a set of effects
-_DESCRIBED = 0.5  # of the square of what shows of a structure: an effect that takes more describes it
+_UNEVEN = 1.0  # standard deviation of the logarithm of the jacks' softness, about each axis
+_PAIR_ERRORS = 2, 4  # number of joints with an error that depends on a pair of joints: minimum, and maximum + 1
+_TRIALS = 20  # attempts to draw a structure that no effect of the library describes, and to draw a set of effects
+_DESCRIBED = 0.5  # an effect describes a structure if it explains more than this share of its squared visible part
 
 
 @dataclass(frozen=True)
@@ -39,9 +39,9 @@ class UnknownDraw:
     """Sizes of the unknown structure of a machine, in units of the noise.
 
     Attributes:
-        size: of all together.
-        wander: of the part that is an error of the fixes.
-        wander_poses: over which that forgets.
+        size: size of the whole structure.
+        wander: size of the wandering error of the fixes.
+        wander_poses: correlation length of the wandering error in poses.
     """
 
     size: float
@@ -50,7 +50,7 @@ class UnknownDraw:
 
     @property
     def structure(self) -> float:
-        """Size of the part that the machine's joints decide."""
+        """Size of the part that depends on the machine's joints."""
         return float(np.sqrt(self.size**2 - self.wander**2))
 
 
@@ -67,16 +67,17 @@ def draw_machine(
     """Draw the hidden effects and the unknown structure of a scene.
 
     Args:
-        scene: the data, with the error that wanders in its noise.
-        visibility: of displacements in it.
-        sizes: of the unknown structure.
-        seed: the same seed draws the same.
+        scene: the scene, with the wandering error in its noise.
+        visibility: visible part of displacements in the scene.
+        sizes: sizes of the unknown structure.
+        seed: the same seed gives the same result.
 
     Returns:
-        The hidden effects, each with its visible size on its own, and the effects that make up the unknown structure.
+        The hidden effects, each with the visible size that it has alone, and the effects that form the unknown
+        structure.
 
     Raises:
-        UnreachableError: the rig has no six families of which ten effects can be seen beside each other.
+        UnreachableError: the rig does not have six families with ten effects that are visible together.
     """
     rng = np.random.default_rng([seed, 60])
     basis = MachineBasis(scene, visibility)
@@ -89,7 +90,7 @@ def draw_machine(
 def _unknown(
     scene: Scene, visibility: Visibility, basis: MachineBasis, size: float, rng: np.random.Generator
 ) -> tuple[Effect, ...]:
-    """Draw structure of this visible size together, each part of some share of it."""
+    """Draw a structure with this total visible size, split at random between its parts."""
 
     def seed() -> int:
         return int(rng.integers(1 << 31))
@@ -119,7 +120,7 @@ def _undescribed(scene: Scene, basis: MachineBasis, draw: Callable[[], Effect]) 
         drawn = draw()
         if basis.described(scene.displacement_mm([drawn])) <= _DESCRIBED:
             return drawn
-    raise UnreachableError(f"{drawn.family}: an effect of the library describes it")
+    raise UnreachableError(f"{drawn.family}: every draw is described by an effect of the library")
 
 
 def _sized(scene: Scene, visibility: Visibility, part: Effect, size: float) -> Effect:
@@ -133,7 +134,7 @@ def _scaled(part: Effect, factor: float) -> Effect:
 def _effects(
     scene: Scene, visibility: Visibility, basis: MachineBasis, rng: np.random.Generator
 ) -> tuple[HiddenEffect, ...]:
-    """Draw ten effects of six families, each seen beside the others."""
+    """Draw ten effects of six families, each visible in the presence of the others."""
     known = np.array([name for name in LIBRARY if scene.draws.places(name)])
     for _ in range(_TRIALS):
         hidden: list[HiddenEffect] = []
@@ -150,7 +151,7 @@ def _effects(
                 break
         else:
             return tuple(hidden)
-    raise UnreachableError("no ten effects of six families are seen beside each other")
+    raise UnreachableError("found no ten effects of six families that are visible together")
 
 
 def _of_family(
@@ -162,7 +163,7 @@ def _of_family(
     before: Sequence[HiddenEffect],
     rng: np.random.Generator,
 ) -> list[HiddenEffect]:
-    """Draw effects of one family at `count` places, fewer where not so many are seen beside those before."""
+    """Draw effects of one family at `count` places, or fewer if not all are visible in addition to `before`."""
     found: list[HiddenEffect] = []
     for place in rng.permutation(np.array(scene.draws.places(family))).tolist():
         if len(found) == count:
@@ -178,7 +179,7 @@ def _of_family(
 
 
 def _reached(size: float, scene: Scene, drawn: Bounded, visibility: Visibility) -> HiddenEffect:
-    """Return an effect of a visible size, or as near to it as its hard bounds allow."""
+    """Return an effect of the given visible size, or as close to it as its hard bounds allow."""
     plausible = visibility.size(scene.displacement_mm([drawn.effect]))
     effect = drawn.scaled(min(size / plausible, drawn.most) if plausible > 0.0 else drawn.most)
     return HiddenEffect(effect, visibility.size(scene.displacement_mm([effect])))

@@ -1,4 +1,4 @@
-"""Directions in which the effects of a machine may show, to tell whether each shows beside all the others."""
+"""Visible directions of a machine's effects, to check whether each effect is visible in addition to all others."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from simulators.effects.unknown import LENGTH, scaled_reading
 from simulators.rig.screws import Floats
 
 _CURVES = ("joint_error_map",)
-_KNOTS = 16  # of a free curve of a joint's angle, over its range
+_KNOTS = 16  # number of knots of a free curve over a joint's range
 _STEP_RAD, _STEP_MM = 1e-5, 1e-2
-_FLAT = 1e-6  # of the largest: directions with less have no share in a covariance
+_FLAT = 1e-6  # directions below this share of the largest value are dropped
 
 
 class MachineBasis:
@@ -25,7 +25,7 @@ class MachineBasis:
 
     Args:
         scene: the data.
-        visibility: of displacements in it.
+        visibility: visible part of displacements in the scene.
     """
 
     def __init__(self, scene: Scene, visibility: Visibility) -> None:
@@ -35,7 +35,7 @@ class MachineBasis:
         self._spaces: dict[Effect, Floats] = {}
 
     def beside(self, effects: Sequence[Effect]) -> tuple[float, ...]:
-        """Return the visible size of each effect that the others, with any coefficients, do not imitate."""
+        """Return the visible size of each effect's part that the others, with any coefficients, cannot imitate."""
         spaces = [self._space(effect) for effect in effects]
         out = []
         for number, effect in enumerate(effects):
@@ -46,18 +46,22 @@ class MachineBasis:
         return tuple(out)
 
     def described(self, displacement_mm: Floats) -> float:
-        """Return the largest share of the square of a displacement (n, 3) that one effect of the library takes."""
+        """Return the largest share of a squared visible displacement that a single effect of the library explains.
+
+        Args:
+            displacement_mm: (n, 3) displacement.
+        """
         signal = self._visibility.seen(displacement_mm[:, :, None])[:, 0]
         return max(float(np.sum((Q.T @ signal) ** 2) / np.sum(signal**2)) for Q in self._orthonormal)
 
     def separable(self, effects: Sequence[Effect], unknown: float) -> tuple[bool, ...]:
-        """Return, for each effect, whether the data tell it from every other effect and place.
+        """Return, for each effect, True if the data distinguish it from every other effect and place.
 
-        The other hidden effects may have any coefficients meanwhile, and structure of pairs of joints is unknown.
+        The other hidden effects may have any coefficients, and structure that depends on pairs of joints is unknown.
 
         Args:
-            effects: hidden ones.
-            unknown: visible size of that structure.
+            effects: the hidden effects.
+            unknown: visible size of the unknown structure.
         """
         whiten = np.linalg.inv(np.linalg.cholesky(self._covariance(unknown)))
         spaces = [whiten @ self._space(effect) for effect in effects]
@@ -78,14 +82,14 @@ class MachineBasis:
         return tuple(told)
 
     def _shown(self, effect: Effect) -> Floats:
-        """(3 n,) visible displacement by an effect."""
+        """Return the (3 n,) visible displacement by an effect."""
         if effect not in self._signals:
             moved_mm = self._scene.displacement_mm([effect])
             self._signals[effect] = self._visibility.seen(moved_mm[:, :, None])[:, 0]
         return self._signals[effect]
 
     def _space(self, effect: Effect) -> Floats:
-        """(3 n, k) columns of all that an effect's coefficients may do."""
+        """Return (3 n, k) columns that span the visible displacements by any coefficients of an effect."""
         if effect not in self._spaces:
             if effect.family in _CURVES:
                 self._spaces[effect] = self._curves(effect.where)
@@ -94,7 +98,7 @@ class MachineBasis:
         return self._spaces[effect]
 
     def _curves(self, joint: str) -> Floats:
-        """(3 n, k) columns of a free curve of a joint's angle, each of 1 mrad."""
+        """Return the (3 n, k) columns of a free curve of a joint's angle, each for 1 mrad."""
         read = self._read
         at = scaled_reading(self._scene.truth.rig, joint, read)
         knots = np.linspace(-1.0, 1.0, _KNOTS)
@@ -103,12 +107,12 @@ class MachineBasis:
 
     @cached_property
     def _library(self) -> list[tuple[Effect, Floats]]:
-        """Every form of every effect of the library at all its places, with its columns; free curves apart."""
+        """Every variant of every library effect at all its places, with its columns; without free curves."""
         return [(form, self._visibility.seen(mm)) for form, mm in library_columns_mm(self._scene)]
 
     @cached_property
     def _orthonormal(self) -> list[Floats]:
-        """Orthonormal columns of every effect of the library, free curves of each revolute joint among them."""
+        """Orthonormal columns of every effect of the library, including free curves of each revolute joint."""
         curves = [self._curves(joint) for joint in self._scene.draws.places(_CURVES[0])]
         return [np.linalg.qr(columns)[0] for columns in (*(columns for _, columns in self._library), *curves)]
 
@@ -130,7 +134,10 @@ class MachineBasis:
         return out
 
     def _covariance(self, size: float) -> Floats:
-        """(3 n, 3 n) of noise and of unknown structure of this visible size, spread over all pairs and all joints."""
+        """Return the (3 n, 3 n) covariance of noise and of unknown structure of this visible size.
+
+        The structure is spread evenly over all pairs and all joints.
+        """
         rig, n = self._scene.truth.rig, len(self._scene.training.prism)
         read = self._read
         single = [_centred_kernel(scaled_reading(rig, name, read)) for name in rig.joint_names]
@@ -154,7 +161,7 @@ class MachineBasis:
 
 
 def _centred_kernel(at: Floats) -> Floats:
-    """(n, n) covariance of a curve about its mean over -1 to 1."""
+    """Return the (n, n) covariance of a curve about its mean over -1 to 1."""
     even = np.linspace(-1.0, 1.0, 41)
 
     def kernel(a: Floats, b: Floats) -> Floats:
@@ -166,13 +173,13 @@ def _centred_kernel(at: Floats) -> Floats:
 
 
 def _free_of(Q: Floats, columns: Floats) -> Floats:
-    """Return columns, or one, without what lies in the space of orthonormal columns Q."""
+    """Return one or several columns without their part in the space of the orthonormal columns Q."""
     left: Floats = columns - Q @ (Q.T @ columns)
     return left
 
 
 def _within(columns: Floats, signal: Floats) -> Floats:
-    """(m,) part of a signal that columns (m, k) imitate."""
+    """Return the (m,) part of a signal that the (m, k) columns can imitate."""
     U, S, _ = np.linalg.svd(columns, full_matrices=False)
     kept = U[:, _FLAT * S[0] < S]
     inside: Floats = kept @ (kept.T @ signal)

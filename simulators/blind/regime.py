@@ -1,4 +1,4 @@
-"""Effects of the library in a part of the data: which part the data tell from every other, and where it may end."""
+"""Library effects that act in a part of the data, drawn so that the data distinguish this part from all others."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from simulators.effects.part import Part, PartialEffect
 from simulators.rig.screws import Floats
 
 KINDS = ("own joint", "other joint", "load", "warmth", "time", "rows")
-BORDER_WITHIN = 0.1  # of the variable's range
-ROW = "row"  # number of a row, where the data have no time
+BORDER_WITHIN = 0.1  # tolerance of a border as a share of the variable's range
+ROW = "row"  # row number, used as the variable if the data have no time
 
-_QUANTILES = 0.3, 0.7  # of the variable's values, between which the border is
-_TRIALS = 8  # of each family, until one is seen and told from all others
+_QUANTILES = 0.3, 0.7  # quantiles of the variable's values between which the border lies
+_TRIALS = 8  # attempts per family to find an effect that is visible and distinguishable
 _SCALINGS = 3
-_ELSEWHERE = np.linspace(0.1, 0.9, 17)  # quantiles at which another part may end
-# Families that act from an instant on, by time or by warmth themselves, or in the line of sight, have no part here; nor
-# have those that a free curve or the sign of a load describes in part.
+_ELSEWHERE = np.linspace(0.1, 0.9, 17)  # quantiles of the borders of alternative parts
+# Families that cannot act in a part of the data: those that act from an instant on, depend on time or temperature
+# themselves, or act in the line of sight, and those that a free curve or the sign of a load can partly describe.
 _WHOLE = (
     "joint_error_map",
     "gravity_flip_play",
@@ -52,9 +52,8 @@ class Regime:
 
     Attributes:
         hidden: the effect, a `PartialEffect`.
-        by_row: the data have no time, and its part begins or ends with a row.
-        label: what the scorer needs: `variable`, `above`, `border`, and `low` and `high`, between which a border is
-            right.
+        by_row: the data have no time, and the part begins or ends with a row.
+        label: data for the scorer: `variable`, `above`, `border`, and the limits `low` and `high` of a right border.
     """
 
     hidden: HiddenEffect
@@ -63,16 +62,16 @@ class Regime:
 
 
 def draw_regime(scene: Scene, visibility: Visibility, size: float, rng: np.random.Generator) -> Regime:
-    """Draw an effect that acts in a part of a scene's data, and that these tell from every other effect and part.
+    """Draw an effect that acts in a part of a scene's data and is distinguishable from every other effect and part.
 
     Args:
         scene: the data.
-        visibility: of displacements in it.
+        visibility: visible part of displacements in the scene.
         size: visible size of the effect over all rows, in units of the noise.
-        rng: source.
+        rng: random generator.
 
     Raises:
-        UnreachableError: no such effect is seen so large within its hard bounds.
+        UnreachableError: no such effect reaches this size within its hard bounds.
     """
     kind = str(rng.choice(KINDS))
     known = [name for name in LIBRARY if name not in _WHOLE and scene.draws.places(name)]
@@ -90,11 +89,11 @@ def draw_regime(scene: Scene, visibility: Visibility, size: float, rng: np.rando
             factor = min(factor * size / shown, drawn.most) if shown > 0.0 else drawn.most
         if abs(shown - size) <= 0.05 * size and alternatives.are_told_from(acting):
             return Regime(HiddenEffect(acting, shown), kind == "rows", _label(scene, part, by_row=kind == "rows"))
-    raise UnreachableError(f"no effect in a part of the data is seen at {size:g} and told from all others")
+    raise UnreachableError(f"found no effect of size {size:g} in a part of the data that differs from all others")
 
 
 def _variables(scene: Scene, kind: str, where: str) -> list[str]:
-    """Variables of one kind, of which a part of the data may be of an effect at a place."""
+    """Return the variables of one kind that can define the part for an effect at a place."""
     names, columns = scene.truth.rig.joint_names, scene.training.columns
     if kind == "own joint":
         return [where] if where in names else []
@@ -116,7 +115,7 @@ def _part(scene: Scene, variable: str, rng: np.random.Generator) -> Part:
 
 
 def _values(scene: Scene, variable: str) -> Floats:
-    """(n,) of a part's variable in the training's rows, without any sensor's error."""
+    """Return the (n,) values of a part's variable in the training rows, without sensor errors."""
     fixes = scene.training
     if variable.startswith("torque("):
         joint = variable.removeprefix("torque(").removesuffix(")")
@@ -125,10 +124,10 @@ def _values(scene: Scene, variable: str) -> Floats:
 
 
 def _label(scene: Scene, part: Part, *, by_row: bool) -> dict[str, Any]:
-    """Return a part as the scorer needs it; a border that leaves no row on another side is right in any case."""
+    """Return the scorer's label of a part; any border that leaves all rows on their side counts as right."""
     values, border, variable = _values(scene, part.variable), part.border, part.variable
     if by_row:
-        number = np.arange(float(len(values)))  # rows are in the order of time
+        number = np.arange(float(len(values)))  # rows are ordered by time
         border, values, variable = float(number[values <= border].max()) + 0.5, number, ROW
     margin = BORDER_WITHIN * float(np.ptp(values))
     low, high = float(values[values <= border].max()) - margin, float(values[values > border].min()) + margin
@@ -144,7 +143,7 @@ class _Alternatives:
         self._library = library_columns_mm(scene)
 
     def are_told_from(self, acting: PartialEffect) -> bool:
-        """Return whether the effect in its part beats the rest by `MARGIN` in all but 2 % of draws of the noise."""
+        """Return True if the effect in its part beats all others by `MARGIN` in all but 2 % of draws of the noise."""
         signal = self._visibility.seen(self._scene.displacement_mm([acting])[:, :, None])[:, 0]
         inside = acting.part.holds(_values(self._scene, acting.part.variable)).astype(float)
         whole_mm = effect_columns_mm(self._scene, acting.effect)
@@ -156,7 +155,10 @@ class _Alternatives:
         return True
 
     def _others(self, acting: PartialEffect, whole_mm: Floats, inside: Floats) -> Iterator[Floats]:
-        """Yield (n, 3, k) mm of each alternative: the effect in all rows or other parts, others in all or this."""
+        """Yield the (n, 3, k) columns in mm of each alternative.
+
+        Alternatives are the effect in all rows or in other parts, and other effects in all rows or in this part.
+        """
         yield whole_mm
         label = _label(self._scene, acting.part, by_row=False)
         for variable in self._part_variables():

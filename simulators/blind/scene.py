@@ -21,7 +21,7 @@ Floats = NDArray[np.float64]
 Strings = NDArray[np.str_]
 Flags = NDArray[np.bool_]
 
-_MISJUDGED = 0.05  # the stated sigma is wrong by a factor from 1 - this to 1 + this
+_MISJUDGED = 0.05  # the stated sigma is wrong by a factor of up to 1 -+ this
 
 
 @dataclass(frozen=True)
@@ -30,14 +30,14 @@ class SceneSettings:
 
     Attributes:
         plan: see `duty_cycle.draw_poses`.
-        poses, held_out: number of poses to train on, and to judge by; both are of one plan and one duty cycle, mixed at
-            random.
-        repeats: fixes in a pose, of the prism farthest along the machine.
+        poses, held_out: number of training poses and of hold-out poses; both come from one plan and one duty cycle,
+            mixed at random.
+        repeats: number of fixes in a pose, of the prism farthest along the machine.
         moving: share of the poses that are measured while joints creep through them.
-        is_decoy: the temperature follows the time in place of a daily course, and signals are recorded that nothing
-            depends on.
-        missing: columns that the data lacks: names, or endings that begin with `_` (`_dir`).
-        sigma_columns: the data says how uncertain each fix is.
+        is_decoy: the temperature follows the time instead of a daily course, and signals are recorded on which nothing
+            depends.
+        missing: columns that the data lack: names, or endings that begin with `_` (`_dir`).
+        sigma_columns: the data contain the uncertainty of each fix.
         noise: see `NoiseSettings`.
     """
 
@@ -57,10 +57,10 @@ class Fixes:
     """n fixes without measurement errors.
 
     Attributes:
-        prism: (n,) names.
+        prism: (n,) names of the prisms.
         pose: (n,) number of the standstill.
-        joints: joint name -> (n,) at the instant of the fix, deg or mm.
-        columns: everything that effects may depend on, without any sensor's error -> (n,).
+        joints: joint name -> (n,) value at the instant of the fix, deg or mm.
+        columns: name -> (n,) true value of a quantity on which effects may depend, without sensor errors.
     """
 
     prism: Strings
@@ -69,7 +69,7 @@ class Fixes:
     columns: Mapping[str, Floats]
 
     def places_mm(self, machine: RigTruth, joints: Mapping[str, Floats] | None = None) -> Floats:
-        """(n, 3) true positions, for these joints or others."""
+        """Return the (n, 3) true positions; with the fixes' own joints if `joints` is None."""
         return prisms_mm(machine, self.prism, self.joints if joints is None else joints, self.columns)
 
 
@@ -78,10 +78,10 @@ class MeasuredFixes(Fixes):
     """n fixes with their true values and their measurement errors.
 
     Attributes:
-        readings: joint name -> (n,) of encoders and transducers, deg or mm.
-        recorded: further columns as their sensors give them -> (n,).
-        noise: of the fixes.
-        stated_sigma_mm: (n, 3) standard deviation that the data states.
+        readings: joint name -> (n,) readings of encoders and transducers, deg or mm.
+        recorded: name -> (n,) further columns, with sensor errors.
+        noise: noise of the fixes.
+        stated_sigma_mm: (n, 3) standard deviation that the data state.
     """
 
     readings: Mapping[str, Floats]
@@ -95,8 +95,8 @@ class Observed:
     """Data of a machine with hidden effects.
 
     Attributes:
-        training: rows that a search may see. Its `oracle_mm` is the prisms' positions if the joints are as read.
-        held_out: other poses of the same duty cycle without any noise, to judge by.
+        training: rows that a search may see. Its `oracle_mm` has the prisms' positions at the joints' readings.
+        held_out: hold-out poses of the same duty cycle, without any noise.
     """
 
     training: SimulatedObservations
@@ -109,11 +109,11 @@ class Scene:
 
     Attributes:
         truth: the machine, without effects.
-        settings: as drawn with.
-        training: fixes to train on.
-        held_out: fixes to judge by.
-        misjudged: factor from the noise's sigma to the stated one.
-        draws: effects that may be hidden in it.
+        settings: settings with which the scene was drawn.
+        training: training fixes.
+        held_out: hold-out fixes.
+        misjudged: factor from the true sigma of the noise to the stated sigma.
+        draws: generator of effects that can be hidden in the scene.
     """
 
     truth: RigTruth
@@ -124,17 +124,17 @@ class Scene:
     draws: EffectDraws
 
     def displacement_mm(self, effects: Sequence[Effect]) -> Floats:
-        """(n, 3) displacement of the training's fixes by effects, mm in the station's frame."""
+        """Return the (n, 3) displacement of the training fixes by effects, mm in the station's frame."""
         return self.training.places_mm(self.machine(effects)) - self._plain_mm
 
     def machine(self, effects: Sequence[Effect]) -> RigTruth:
-        """Return the machine with effects; time and temperature they leave open count from the training's."""
+        """Return the machine with effects, whose open time and temperature references are set to the training's."""
         zero = self.draws.first_s, self.draws.mean_degC
         return replace_effects(self.truth, [effect.anchored(*zero) for effect in effects])
 
     @cached_property
     def noise_rms_mm(self) -> float:
-        """RMS of the 3-D difference of fixes and a perfect model at the readings, in training; without outliers."""
+        """RMS of the 3-D difference between training fixes and a perfect model at the readings, without outliers."""
         from_readings = self._plain_mm - self.training.places_mm(self.truth, self.training.readings)
         off = (self.training.noise.error_mm + from_readings)[~self.training.noise.is_outlier]
         return float(np.sqrt(np.mean(np.sum(off**2, axis=1))))
@@ -144,7 +144,7 @@ class Scene:
         return self.training.places_mm(self.truth)
 
     def observe(self, effects: Sequence[Effect]) -> Observed:
-        """Return the data of the machine with effects; without any, its twin of the same noise."""
+        """Return the data of the machine with effects; with no effects, of its twin with the same noise."""
         machine, there = self.machine(effects), self.held_out
         exact_mm = there.places_mm(machine)
         columns = {name: there.columns[name] for name in self.training.recorded}
@@ -159,12 +159,12 @@ class Scene:
         *,
         columns: Mapping[str, Floats] | None = None,
     ) -> SimulatedObservations:
-        """Return the data of k further poses, taken after the training's in the order given.
+        """Return the data of k further poses, measured after the training poses in the given order.
 
         Args:
-            effects: hidden ones, the same as of the training.
+            effects: the hidden effects, the same as for the training.
             poses: joint name -> (k,) deg or mm.
-            seed: of the noise.
+            seed: seed of the noise.
             columns: conditions (`theta4_dir`, `L2_rate`, `payload_kg`, `dwell_s`, `temperature_degC`, `time_s`) and
                 number of `fixes` -> (k,). The defaults are standstills of 20 s, a minute apart and
                 straight from pose to pose, with the payload and the temperature of the training's end.
@@ -208,12 +208,12 @@ def draw_scene(rig: Rig, seed: int, settings: SceneSettings | None = None) -> Sc
     """Draw a machine, its duty cycle and its noise.
 
     Args:
-        rig: the description.
+        rig: description of the rig.
         seed: the same seed draws the same scene.
-        settings: the defaults if None.
+        settings: settings of the scene; None for the defaults.
 
     Raises:
-        ValueError: impossible settings; the message says which.
+        ValueError: a setting is impossible; the message names it.
     """
     settings = settings or SceneSettings()
     _check(settings)
@@ -221,7 +221,7 @@ def draw_scene(rig: Rig, seed: int, settings: SceneSettings | None = None) -> Sc
     truth = RigTruth(rig, seed)
     total = settings.poses + settings.held_out
     duty = draw_duty_cycle(truth, total, settings.plan, rng, moving=settings.moving, is_decoy=settings.is_decoy)
-    # The first and the last pose are trained on: nothing is asked of times beyond the data's.
+    # The first and the last pose are training poses, so that no hold-out pose lies outside the training's time
     is_training = np.zeros(total, dtype=bool)
     is_training[[0, total - 1, *(1 + rng.permutation(total - 2)[: settings.poses - 2])]] = True
     travelled = _travelled(rig, duty, is_training)
@@ -251,9 +251,9 @@ def _measure(
     first: int = 0,
     repeats: Floats | None = None,
 ) -> MeasuredFixes:
-    """Measure the chosen poses of a duty cycle, all if None; their numbers begin at `first`.
+    """Measure the chosen poses of a duty cycle (all if None) and number them from `first` on.
 
-    `repeats` is the number of fixes of each pose, as in the settings if None.
+    `repeats` is the number of fixes of each pose; None for the number in the settings.
     """
     rig, n = truth.rig, len(duty.columns["time_s"])
     which = np.arange(n) if chosen is None else np.flatnonzero(chosen)
@@ -276,7 +276,7 @@ def _measure(
 
 
 def _travelled(rig: Rig, duty: DutyCycle, is_training: Flags) -> dict[str, Floats]:
-    """`<joint>_travel_m` -> (n,) along the training's poses alone, as if the others had not been visited."""
+    """Return `<joint>_travel_m` -> (n,) along the training poses only, as if the others had not been visited."""
     time_s = duty.columns["time_s"]
     path = travel_m(rig, {k: v[is_training] for k, v in duty.joints.items()})
     return {k: np.interp(time_s, time_s[is_training], v) for k, v in path.items()}
@@ -290,7 +290,7 @@ def _fixes(
     settings: SceneSettings,
     repeats: Floats | None = None,
 ) -> Fixes:
-    """Fixes of the last prism, `repeats` times at each of the chosen poses, one a second."""
+    """Return fixes of the last prism, `repeats` times at each of the chosen poses, one per second."""
     of_each = np.full(len(chosen), settings.repeats) if repeats is None else repeats.astype(np.intp)
     pose = np.repeat(chosen, of_each)
     shot = np.arange(len(pose)) - np.repeat(np.cumsum(of_each) - of_each, of_each)
@@ -302,12 +302,12 @@ def _fixes(
 
 
 def _last_prism(rig: Rig) -> str:
-    """Name of the prism farthest along the machine."""
+    """Return the name of the prism farthest along the machine."""
     return max(rig.prisms, key=lambda prism: prism.frame).name
 
 
 def _check(settings: SceneSettings) -> None:
     if settings.poses < 3 or settings.held_out < 1 or settings.repeats < 1:
-        raise ValueError("a scene takes 3 poses or more, 1 held-out pose or more, and 1 fix or more of each")
+        raise ValueError("a scene needs at least 3 poses, 1 held-out pose and 1 fix of each")
     if not 0.0 <= settings.moving <= 1.0:
-        raise ValueError("a scene takes a moving share from 0 to 1")
+        raise ValueError("the moving share of a scene must be from 0 to 1")

@@ -1,11 +1,11 @@
 """Visible size of a displacement: the part that a calibration of the machine's constants does not absorb.
 
-Calibration refits a machine's constants, each within its build tolerance, and so imitates part of any effect. A
-displacement d of n fixes with noise covariance C, of which constants with derivatives J and tolerances P can take a
-share, is seen as Sigma^-1/2 d, Sigma = C + J P J'. In that space noise has variance 1 in every direction, and the RMS
-of d over its 3 n components is its visible size in units of the noise.
+Calibration fits a machine's constants, each within its build tolerance, and so imitates part of any effect. Let d be a
+displacement of n fixes with noise covariance C, and let constants with derivatives J and tolerances P absorb a part of
+it. Its visible part is Sigma^-1/2 d with Sigma = C + J P J'. In this space the noise has variance 1 in every direction,
+and the RMS of the visible part over its 3 n components is the visible size of d in units of the noise.
 
-Derivatives are differences of the simulator's own kinematics, so that this measure owes nothing to the analysis.
+Derivatives are differences of the simulator's own kinematics, so that this measure is independent of the analysis.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from simulators.rig.truth import RigTruth
 
 Strings = NDArray[np.str_]
 
-_STEP = 1e-3  # of a tolerance: differences stay linear, and far above rounding
-_FREE_MM = 1e3  # a base or a prism that is not known at all
+_STEP = 1e-3  # share of a tolerance: differences stay linear, and far above rounding
+_FREE_MM = 1e3  # for the position of a base or a prism that is completely unknown
 _FREE_RAD = 1.0
 
 
@@ -30,10 +30,10 @@ class Visibility:
     """The part of displacements of n fixes that calibration does not absorb.
 
     Args:
-        truth: the machine; its hidden effects play no part.
-        prism: (n,) names.
-        joints: joint name -> (n,) where they are, deg or mm.
-        covariance_mm2: (n, 3, 3) of the noise of each fix, station's frame.
+        truth: the machine; its hidden effects are ignored.
+        prism: (n,) names of the prisms.
+        joints: joint name -> (n,) value, deg or mm.
+        covariance_mm2: (n, 3, 3) covariance of the noise of each fix in the station's frame.
     """
 
     def __init__(self, truth: RigTruth, prism: Strings, joints: Mapping[str, Floats], covariance_mm2: Floats) -> None:
@@ -42,14 +42,14 @@ class Visibility:
         self._taken = U, 1.0 - 1.0 / np.sqrt(1.0 + S**2)
 
     def seen(self, displacement_mm: Floats) -> Floats:
-        """(3 n, k) visible part of displacements (n, 3, k), in units of the noise."""
+        """Return the (3 n, k) visible part of (n, 3, k) displacements, in units of the noise."""
         U, taken = self._taken
         own = self._per_fix(displacement_mm)
         left: Floats = own - U @ (taken[:, None] * (U.T @ own))
         return left
 
     def size(self, displacement_mm: Floats) -> float:
-        """Visible size of one displacement (n, 3): RMS in units of the noise."""
+        """Return the visible size of one (n, 3) displacement: RMS in units of the noise."""
         return float(np.sqrt(np.mean(self.seen(displacement_mm[:, :, None]) ** 2)))
 
     def _per_fix(self, columns: Floats) -> Floats:
@@ -59,11 +59,11 @@ class Visibility:
 def reading_covariance_mm2(
     truth: RigTruth, prism: Strings, joints: Mapping[str, Floats], sigma: Mapping[str, Floats]
 ) -> Floats:
-    """(n, 3, 3) covariance of the fixes by independent errors of the joints' readings.
+    """Return the (n, 3, 3) covariance of the fixes due to independent errors of the joints' readings.
 
     Args:
-        truth: the machine; its hidden effects play no part.
-        prism: (n,) names.
+        truth: the machine; its hidden effects are ignored.
+        prism: (n,) names of the prisms.
         joints: joint name -> (n,) deg or mm.
         sigma: joint name -> (n,) standard deviation of its reading, deg or mm.
     """
@@ -75,26 +75,26 @@ def reading_covariance_mm2(
 def timing_covariance_mm2(
     truth: RigTruth, prism: Strings, joints: Mapping[str, Floats], late: Mapping[str, Floats]
 ) -> Floats:
-    """(n, 3, 3) covariance of the fixes by an error of the instant, the same for all joints.
+    """Return the (n, 3, 3) covariance of the fixes due to a timing error that is the same for all joints.
 
     Args:
-        truth: the machine; its hidden effects play no part.
-        prism: (n,) names.
+        truth: the machine; its hidden effects are ignored.
+        prism: (n,) names of the prisms.
         joints: joint name -> (n,) deg or mm.
-        late: joint name -> (n,) change of its value in one standard deviation of the instant, deg or mm.
+        late: joint name -> (n,) change of its value in one standard deviation of the timing error, deg or mm.
     """
     J = _moved_by(truth, prism, joints, late)
     return J[:, :, None] * J[:, None, :]
 
 
 def _moved_by(truth: RigTruth, prism: Strings, joints: Mapping[str, Floats], steps: Mapping[str, Floats]) -> Floats:
-    """(n, 3) displacement of fixes by these steps of the joints, to first order."""
+    """Return the (n, 3) displacement of fixes by these steps of the joints, to first order."""
     there = {**joints, **{name: joints[name] + step * _STEP for name, step in steps.items()}}
     return (_places_mm(truth, prism, there) - _places_mm(truth, prism, joints)) / _STEP
 
 
 def _derivatives(truth: RigTruth, prism: Strings, joints: Mapping[str, Floats]) -> Floats:
-    """(n, 3, p) displacement by one tolerance of each constant that calibration may correct, mm."""
+    """Return the (n, 3, p) displacement in mm by one tolerance of each constant that calibration may correct."""
     rig = truth.rig
     at = _places_mm(truth, prism, joints)
     angle, beta = np.deg2rad([rig.tolerances.angle_deg, rig.tolerances.beta_deg])
@@ -111,7 +111,7 @@ def _derivatives(truth: RigTruth, prism: Strings, joints: Mapping[str, Floats]) 
         if target.name in prism:
             spread = rig.tolerances.prism_mm if target.offset_known else _FREE_MM
             columns += [_places_mm(truth, prism, joints, moved=(target.name, axis * spread)) - at for axis in np.eye(3)]
-    for axis in np.eye(3):  # where the base stands is found freely
+    for axis in np.eye(3):  # the pose of the base is free
         columns.append(np.broadcast_to(axis * _FREE_MM, at.shape))
         columns.append(np.cross(axis, at - truth.placement().position_mm) * _FREE_RAD)
     return np.stack(columns, axis=2)
@@ -125,14 +125,14 @@ def _places_mm(
     constants: Sequence[RowConstants] | None = None,
     moved: tuple[str, Floats] = ("", np.zeros(3)),
 ) -> Floats:
-    """(n, 3) fixes in the station's frame, mm, of a machine without effects.
+    """Return the (n, 3) fixes of a machine without effects, in mm in the station's frame.
 
     Args:
         truth: the machine.
-        prism: (n,) names.
+        prism: (n,) names of the prisms.
         joints: joint name -> (n,) deg or mm.
-        constants: of all rows, in place of the machine's own.
-        moved: a prism, and (3,) mm by which it sits elsewhere in its frame.
+        constants: constants of all rows, replacing the machine's own.
+        moved: name of a prism, and (3,) mm by which it is displaced in its frame.
     """
     rig = truth.rig
     chain = screw_chain(rig, truth.constants if constants is None else constants)

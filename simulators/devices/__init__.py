@@ -1,1 +1,1 @@
-"""The devices of a simulated rig, speaking their real protocols."""
+"""The devices of a simulated rig, which use their real protocols."""

@@ -1,4 +1,4 @@
-"""The machine as its devices sense it: joints in motion, the loads on them, and the true places of the prisms."""
+"""The machine for its simulated devices: moving joints, the loads on them, and the true positions of the prisms."""
 
 from __future__ import annotations
 
@@ -30,18 +30,18 @@ class Machine:
     """A true machine in motion, seen from one station set-up.
 
     Attributes:
-        truth, motion: its geometry and its plan.
-        setup: the station set-up.
+        truth, motion: geometry and motion of the machine.
+        setup: name of the station set-up.
         control_points_mm: fixed marks around the machine, in the station's frame: name -> (3,).
 
     Args:
-        truth: its geometry and effects. They count time from simulated second 0, and temperature from `TEMPERATE_DEGC`.
-        seed: control points and reading noise.
-        motion: its plan.
-        setup: station set-up, decides where the machine stands.
+        truth: geometry and effects. Effects count time from simulated second 0 and temperature from `TEMPERATE_DEGC`.
+        seed: seed of the control points and the reading noise.
+        motion: motion of the joints.
+        setup: name of the station set-up, which determines where the machine stands.
 
     Raises:
-        ValueError: an effect needs what this machine does not sense (a payload, a pressure in a boom cylinder).
+        ValueError: an effect needs a quantity that this machine does not measure (a payload, a boom cylinder pressure).
     """
 
     def __init__(self, truth: RigTruth, seed: int, motion: BoomMotion, *, setup: str = "") -> None:
@@ -59,37 +59,38 @@ class Machine:
             self._solve(prism, motion.values(0.0), 0.0)
 
     def joint(self, name: str, t_s: float) -> tuple[float, float]:
-        """Noisy value of a joint as sensed, and its rate: deg or mm."""
+        """Return the noisy value of a joint, and its rate: deg or mm, and per second."""
         value, rate = self.motion.joint(name, t_s)
         return value + self._sigma[name] * self.rng.standard_normal(), rate
 
     def place_mm(self, target: str, t_s: float) -> Floats:
-        """(3,) true position of a prism or control point in the station's frame; KeyError if there is none."""
+        """Return the (3,) true position of a prism or control point in the station's frame; KeyError if unknown."""
         if target in self.control_points_mm:
             return self.control_points_mm[target]
-        # A tracker asks for direction and distance of one instant one after the other.
+        # Cached, as a tracker requests direction and distance of the same instant separately
         last = self._last_place
         if last is None or last[:2] != (target, t_s):
             last = self._last_place = (target, t_s, self._solve(target, self.motion.values(t_s), t_s))
         return last[2]
 
     def prism_at_mm(self, prism: str, pose: Mapping[str, float], columns: Mapping[str, float]) -> Floats:
-        """(3,) true position of a prism in any pose, to check a model against the truth.
+        """Return the (3,) true position of a prism in any pose, to check a model against the truth.
 
         Args:
-            prism: its name.
+            prism: name of the prism.
             pose: joint name -> value, deg or mm.
-            columns: what effects need besides (`theta4_dir`, `theta4_rate`, `boom_valve_mA`, ...); where it is missing
-                the machine has just come to rest at simulated second 0, and joints count as not having moved.
+            columns: other quantities that effects need (`theta4_dir`, `theta4_rate`, `boom_valve_mA`, ...). Missing
+                ones have their values for a machine that has just come to rest at simulated second 0 without any
+                travel of its joints.
 
         Raises:
-            ValueError: unknown prism, a joint missing or unknown.
+            ValueError: the prism is unknown, or a joint is missing or unknown.
         """
         rig = self._rig
         if prism not in rig.prism_names:
             raise ValueError(f"no prism {prism!r}; this rig has {', '.join(rig.prism_names)}")
         if set(pose) != set(rig.joint_names):
-            raise ValueError(f"a pose gives each of {', '.join(rig.joint_names)} once")
+            raise ValueError(f"a pose must have exactly the joints {', '.join(rig.joint_names)}")
         rest = dict.fromkeys(rig.joint_names, 0.0)
         standing = self._columns(rest, dict.fromkeys(rig.joint_names, 0), dwell_s=0.0, travel=rest, t_s=0.0)
         return self._place(prism, pose, standing | dict(columns))
@@ -110,7 +111,7 @@ class Machine:
         travel: Mapping[str, float],
         t_s: float,
     ) -> dict[str, float]:
-        """Columns that effects may depend on besides the pose, without any sensor's noise."""
+        """Return the columns on which effects may depend in addition to the pose, without sensor noise."""
         speeds = {j.name: rates[j.name] / j.max_rate for j in self._rig.joints}
         columns = {f"{j}_dir": float(d) for j, d in directions.items()} | {f"{j}_rate": r for j, r in rates.items()}
         columns |= {f"{j.name}_travel_m": travel[j.name] / 1e3 for j in self._rig.joints if j.kind == "prismatic"}
@@ -125,12 +126,12 @@ class Machine:
         return place
 
     def state(self, t_s: float) -> MachineState:
-        """Speeds and loads for the machine controller's signals."""
+        """Return speeds and loads for the machine controller's signals."""
         speeds = {valve: self.motion.joint(j.name, t_s)[1] / j.max_rate for valve, j in self._valves.items()}
         return MachineState(speeds, self.boom_load_bar(t_s))
 
     def boom_load_bar(self, t_s: float) -> float:
-        """Pressure in the lower side of the boom cylinder."""
+        """Return the pressure in the lower side of the boom cylinder."""
         if "boom" in self._valves and abs(t_s - self._load_at_s) >= _LOAD_EVERY_S:
             self._load_at_s = t_s
             joints = {name: np.array([value]) for name, value in self.motion.values(t_s).items()}
@@ -145,7 +146,7 @@ class Machine:
 
 
 def _control_points(rng: np.random.Generator) -> dict[str, Floats]:
-    """Marks on the walls: all around, 6 to 15 m away, from knee height to the roof."""
+    """Return marks on the walls: all around, 6 to 15 m away, from knee height to the roof."""
     out = {}
     for i in range(_CONTROL_POINTS):
         hz = 2 * np.pi * (i + rng.uniform(0.1, 0.9)) / _CONTROL_POINTS

@@ -1,1 +1,1 @@
-"""Physical effects that the simulated machine can hide, written for the simulator alone."""
+"""Physical effects that can be hidden in the simulated machine, written only for the simulator."""

@@ -1,4 +1,4 @@
-"""The effects found in their folders, and effects as text: `backlash@theta4:width_rad=2e-3,boom_droop@boom`."""
+"""Registry of all effects, and parsing of effects as text: `backlash@theta4:width_rad=2e-3,boom_droop@boom`."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from types import ModuleType
 from simulators.effects import families, outside, variants
 from simulators.effects.base import Effect
 
-# A seed draws from the families in this order, so that it draws the same cases when a family is added: new ones follow.
+# A seed draws from the families in this order. New families follow at the end, so that old cases remain the same.
 _SEEDED_ORDER = (
     "joint_compliance",
     "boom_droop",
@@ -43,11 +43,11 @@ _SEEDED_ORDER = (
 )
 
 
-_LARGEST_INTEGER = 1 << 31  # of a seed
+_LARGEST_INTEGER = 1 << 31  # limit of a seed
 
 
 def _found_in(room: ModuleType) -> dict[str, type[Effect]]:
-    """Effects defined in a module, or in the modules of a package, in alphabetical order of their families."""
+    """Return the effects defined in a module, or in the modules of a package, sorted by family."""
     names = [f"{room.__name__}.{module.name}" for module in pkgutil.iter_modules(getattr(room, "__path__", []))]
     found: dict[str, type[Effect]] = {}
     for module in [importlib.import_module(name) for name in names] or [room]:
@@ -62,20 +62,21 @@ def _in_seeded_order(found: Mapping[str, type[Effect]]) -> dict[str, type[Effect
 
 
 LIBRARY: Mapping[str, type[Effect]] = _in_seeded_order(_found_in(families))
-"""Effects that a library of physical effects names."""
+"""Effects that the library of physical effects contains."""
 
 OUTSIDE: Mapping[str, type[Effect]] = _found_in(outside)
-"""Effects that no library names, in whatever form."""
+"""Effects that are in no library in any form."""
 
 FAMILIES: Mapping[str, type[Effect]] = {**LIBRARY, **_found_in(variants), **OUTSIDE}
 """All effects."""
 
 
 def parse_effects(text: str) -> tuple[Effect, ...]:
-    """Parse `FAMILY@WHERE[:NAME=VALUE[:NAME=VALUE...]]`, separated by commas; "" is none.
+    """Parse effects `FAMILY@WHERE[:NAME=VALUE[:NAME=VALUE...]]`, separated by commas; "" means none.
 
     Raises:
-        ValueError: unknown family or coefficient, or no finite number; the message names the known ones.
+        ValueError: a family or coefficient is unknown (the message lists the known ones), or a value is not a finite
+            number.
     """
     return tuple(_parse_one(part.strip()) for part in text.split(",") if part.strip())
 
@@ -88,13 +89,13 @@ def _parse_one(part: str) -> Effect:
         raise ValueError(f"unknown effect {family!r}; known: {', '.join(sorted(FAMILIES))}")
     if not at or not where:
         place = {"joint": "JOINT", "revolute": "JOINT", "prismatic": "JOINT", "prism": "PRISM"}
-        raise ValueError(f"{part!r}: say where, as in {family}@{place.get(kind.acts_at[0], kind.acts_at[0])}")
+        raise ValueError(f"{part!r}: give the place, as in {family}@{place.get(kind.acts_at[0], kind.acts_at[0])}")
     known = {f.name: f.type for f in fields(kind) if f.name != "where"}
     values: dict[str, float | int] = {}
     for setting in settings:
         name, _, value = setting.partition("=")
         if name not in known:
-            raise ValueError(f"{part!r}: {family} has no {name!r}; it has {', '.join(known)}")
+            raise ValueError(f"{part!r}: {family} has no coefficient {name!r}; known: {', '.join(known)}")
         try:
             number = float(value)
         except ValueError:

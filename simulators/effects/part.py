@@ -1,4 +1,4 @@
-"""An effect that acts in a part of the data only: beyond an angle, under load, in the warmth, from some time on."""
+"""An effect that acts only in a part of the data: beyond an angle, under load, when warm, or from some time on."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ class Part:
     """The rows in which a variable is above a border, or not above it.
 
     Attributes:
-        variable: a joint's name (its reading, deg or mm), `torque(JOINT)` (N m, or N) or an observation column.
-        above: the rows above the border; else all others.
-        border: in the variable's unit.
+        variable: name of a joint (its reading in deg or mm), `torque(JOINT)` (N m, or N) or an observation column.
+        above: True for the rows above the border, False for all other rows.
+        border: border in the variable's unit.
     """
 
     variable: str
@@ -27,13 +27,13 @@ class Part:
     border: float
 
     def holds(self, values: Floats) -> NDArray[np.bool_]:
-        """(n,) True in the rows of the part, of the variable's values (n,)."""
+        """Return an (n,) mask that is True in the rows of the part; `values` are the (n,) values of the variable."""
         beyond = values > self.border
         return beyond if self.above else ~beyond
 
 
 def part_variable(body: Body, variable: str) -> Floats:
-    """(n,) values of a part's variable; ValueError when the caller did not give its column."""
+    """Return the (n,) values of a part's variable; ValueError if the caller did not provide its column."""
     if variable.startswith("torque("):
         return body.torque(variable.removeprefix("torque(").removesuffix(")"))
     if variable in body.rig.joint_names:
@@ -44,11 +44,11 @@ def part_variable(body: Body, variable: str) -> Floats:
 
 @dataclass(frozen=True)
 class PartialEffect(Effect):
-    """An effect, at work in the rows of a part. Effects of the line of sight, which see no rows, do nothing.
+    """An effect that acts only in the rows of a part. Effects in the line of sight, which know no rows, do nothing.
 
     Attributes:
-        effect: at work there.
-        part: the rows.
+        effect: the effect.
+        part: the rows in which it acts.
     """
 
     effect: Effect

@@ -1,4 +1,4 @@
-"""Structure that no library names: smooth functions of two joints, and a carrier on a soft jack."""
+"""Structure that is in no library: smooth functions of two joints, and a carrier on a soft jack."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from calibration.rig.description import Rig
 from simulators.effects.base import Bend, Body, Effect, Floats
 
 LENGTH = 0.8  # correlation length, in units of half a joint's range
-_TERMS = 2  # products of a curve of either joint
+_TERMS = 2  # number of products of one curve of each joint
 _WAVES = 40
 _EVEN_POINTS = 81
 
@@ -21,8 +21,8 @@ _EVEN_POINTS = 81
 class PairSurface:
     """A sum of products of centred smooth curves of two joints; its RMS over their ranges is 1.
 
-    As each curve has mean 0 over its joint's range, the mean over either joint is 0 at any value of the other: no error
-    of a single joint's own angle describes a part of it.
+    As each curve has mean 0 over its joint's range, the mean over either joint is 0 at any value of the other joint.
+    Therefore no error of a single joint's own angle describes a part of the sum.
 
     Attributes:
         first, second: names of the joints.
@@ -34,7 +34,7 @@ class PairSurface:
     seed: int
 
     def values(self, rig: Rig, read: Mapping[str, Floats]) -> Floats:
-        """(n,) at readings, rad or mm."""
+        """Return the (n,) values at readings, joint name -> (n,) rad or mm."""
         rng = np.random.default_rng([self.seed, 73])
         even = np.linspace(-1.0, 1.0, _EVEN_POINTS)
         at = scaled_reading(rig, self.first, read), scaled_reading(rig, self.second, read)
@@ -47,13 +47,13 @@ class PairSurface:
 
 
 def draw_surface(rig: Rig, seed: int) -> PairSurface:
-    """Return the function of two joints of a rig that a seed draws."""
+    """Draw a function of two joints of a rig from a seed."""
     first, second = np.random.default_rng([seed, 72]).choice(np.array(rig.joint_names), 2, replace=False)
     return PairSurface(str(first), str(second), seed)
 
 
 def scaled_reading(rig: Rig, joint: str, read: Mapping[str, Floats]) -> Floats:
-    """(n,) readings of a joint, rad or mm, as -1 to 1 between its limits."""
+    """Return the (n,) readings of a joint (rad or mm) scaled to -1 to 1 between its limits."""
     description = rig.joint(joint)
     low, high = np.deg2rad(description.limits) if description.kind == "revolute" else description.limits
     scaled: Floats = 2.0 * (read[joint] - low) / (high - low) - 1.0
@@ -61,7 +61,7 @@ def scaled_reading(rig: Rig, joint: str, read: Mapping[str, Floats]) -> Floats:
 
 
 def _curve(rng: np.random.Generator, even: Floats, at: Floats) -> tuple[Floats, Floats]:
-    """Draw a curve of Gaussian correlation; returns its values at even points and at others, about its mean."""
+    """Draw a curve with Gaussian correlation; return its values, minus its mean, at `even` and at `at`."""
     cycles, phase = rng.normal(0.0, 1.0 / LENGTH, _WAVES), rng.uniform(0.0, 2.0 * np.pi, _WAVES)
     on_even, values = (np.cos(np.outer(points, cycles) + phase).sum(axis=1) for points in (even, at))
     return on_even - on_even.mean(), values - on_even.mean()
@@ -69,12 +69,12 @@ def _curve(rng: np.random.Generator, even: Floats, at: Floats) -> tuple[Floats, 
 
 @dataclass(frozen=True)
 class JointPairError(Effect):
-    """An error of a joint that two joints decide together: hoses, cable trays and castings that pull on one another.
+    """An error of a joint that depends on two joints together: hoses, cable trays and castings pull on each other.
 
     True value - read value = a smooth function of two joints as read, drawn once from `seed`.
 
     Attributes:
-        rms_rad: its root mean square over their ranges; mm at a prismatic joint: `mm_per_rad` times as much.
+        rms_rad: root mean square over the joints' ranges; for a prismatic joint `mm_per_rad` times as much, in mm.
         seed: the same seed draws the same function of the same two joints.
     """
 
@@ -91,9 +91,9 @@ class JointPairError(Effect):
 
 @dataclass(frozen=True)
 class PlacePairError(Effect):
-    """A displacement of the machine's last frame that two joints decide together: frames that bend and warp.
+    """A displacement of the machine's last frame that depends on two joints together: frames bend and warp.
 
-    The last frame is off by a smooth function of two joints along each axis of the base's frame.
+    The last frame is displaced by a smooth function of two joints along each axis of the base's frame.
 
     Attributes:
         rms_mm: root mean square of each component over the ranges of its two joints.
@@ -114,9 +114,9 @@ class PlacePairError(Effect):
 
 @dataclass(frozen=True)
 class JackLean(Effect):
-    """A carrier on jacks of which those on one side are softer: it leans to where its boom weighs on it.
+    """A carrier on jacks that are softer on one side: it leans to the side that its boom loads.
 
-    Tilt about the base's origin: about its x axis by c_x (M_x + s |M_x|), likewise about y; M moves the weights.
+    Tilt about the base's origin: about its x axis by c_x (M_x + s |M_x|), likewise about y; M is the weights' moment.
 
     Attributes:
         x_rad_per_Nm, y_rad_per_Nm: c.

@@ -1,4 +1,4 @@
-"""Particular forms of library effects: gear teeth make an error map, a reducer is compliant."""
+"""Special forms of library effects: gear teeth with an error map, a compliant reducer."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from simulators.effects.base import Body, DrawContext, Effect, Floats
 class GearMesh(Effect):
     """Teeth that mesh unevenly: an error that repeats with every tooth of a worm wheel or rack.
 
-    d_theta = A cos(n theta) + B sin(n theta), n cycles a turn, theta as read.
+    d_theta = A cos(n theta) + B sin(n theta), n cycles per turn, theta as read.
     """
 
     amplitudes: ClassVar[Mapping[str, float]] = {"cos_rad": 6e-3, "sin_rad": 6e-3}
@@ -33,20 +33,20 @@ class GearMesh(Effect):
 
 @dataclass(frozen=True)
 class StiffeningCompliance(Effect):
-    """A reducer that stiffens under load: soft while its teeth and bearings take up their play, stiff beyond.
+    """A reducer that stiffens under load: soft while its teeth and bearings take up their play, then stiff.
 
-    Compliance falls from a soft zone around zero torque to that of the loaded reducer, in the deflected posture.
+    The compliance falls from a soft zone around zero torque to that of the loaded reducer, in the deflected posture.
 
     dtheta/dtau = stiff + (soft - stiff) / (1 + (tau / knee)^2), so that
     theta(tau) = stiff * tau + (soft - stiff) * knee * arctan(tau / knee).
-    Makers of strain wave and cycloidal reducers state this curve in two or three straight pieces with rising slopes
-    K1 < K2 < K3 (Harmonic Drive engineering data, "torsional stiffness"; Nabtesco RV, "lost motion"). A real joint
-    turns from one slope to the next gradually.
+    Manufacturers of strain wave and cycloidal reducers give this curve as two or three straight pieces with rising
+    slopes K1 < K2 < K3 (Harmonic Drive engineering data, "torsional stiffness"; Nabtesco RV, "lost motion"). In a real
+    joint the slope changes gradually.
 
     Attributes:
         soft_rad_per_Nm: 1 / K1, without load.
-        stiff_rad_per_Nm: 1 / K3, far above the knee; 4e-7 lets 4 kN m turn a joint by 1.6 mrad.
-        knee_Nm: torque at which half of the difference is left.
+        stiff_rad_per_Nm: 1 / K3, far above the knee; with 4e-7, 4 kN m turn a joint by 1.6 mrad.
+        knee_Nm: torque at which half of the difference remains.
     """
 
     amplitudes: ClassVar[Mapping[str, float]] = {"soft_rad_per_Nm": 20e-3, "stiff_rad_per_Nm": 20e-3}

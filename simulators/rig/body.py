@@ -1,4 +1,4 @@
-"""The machine under load at n instants: positions, weights, and displacements by effects."""
+"""The machine under load at n instants: positions, weights, and displacements due to effects."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class PointMass:
-    """A weight: a frame, its place there, and whether `payload_kg` overrides it."""
+    """A weight: its frame, its position in that frame, and whether `payload_kg` overrides its mass."""
 
     frame: int
     place_mm: Floats
@@ -27,18 +27,18 @@ class PointMass:
 
 @dataclass(frozen=True)
 class LoadedBody:
-    """The machine at n instants: `simulators.effects.base.Body`.
+    """The machine at n instants; implements `simulators.effects.base.Body`.
 
     Attributes:
-        rig: the description.
-        read, true: joint name -> (n,) as sensed, and as it is, rad or mm.
-        columns: further observation columns -> (n,).
-        gravity: (3,) m/s^2 in the base frame.
-        masses, constants: the true ones.
-        posture: of the true joints.
-        bent: displacements, from the tip towards the base: each moves everything beyond its frame as one, so that the
-            places that it names are those of a machine that is straight up to there.
-        growth: (n,) share by which all lengths are longer.
+        rig: description of the rig.
+        read, true: joint name -> (n,) reading and true value, rad or mm.
+        columns: name -> (n,) further observation columns.
+        gravity: (3,) acceleration of gravity in the base frame, m/s^2.
+        masses, constants: true weights and row constants.
+        posture: posture at the true joint values.
+        bent: displacements, ordered from the tip towards the base. Each moves everything beyond its frame rigidly, so
+            its positions are those of a machine that is straight up to that frame.
+        growth: (n,) relative increase of all lengths.
     """
 
     rig: Rig
@@ -53,17 +53,22 @@ class LoadedBody:
     growth: Floats
 
     def column(self, name: str) -> Floats:
-        """(n,) an observation column; ValueError when the caller did not give it."""
+        """Return an (n,) observation column; ValueError if the caller did not provide it."""
         if name not in self.columns:
             raise ValueError(f"an effect of this machine needs the column {name!r}")
         return np.atleast_1d(np.asarray(self.columns[name], dtype=float))
 
     def has(self, name: str) -> bool:
-        """True if an observation column was given."""
+        """Return True if the caller provided an observation column."""
         return name in self.columns
 
     def place_mm(self, frame: int, place_mm: Floats) -> Floats:
-        """(n, 3) position in the base frame of a point fixed to a frame, displacements included."""
+        """Return the (n, 3) position in the base frame of a point fixed to a frame, with displacements.
+
+        Args:
+            frame: number of the frame.
+            place_mm: (3,) position of the point in that frame.
+        """
         point: Floats = self.posture.point_mm(frame, place_mm) * (1.0 + self.growth)[:, None]
         for bend in self.bent:
             if self._follows(frame, bend.frame):
@@ -71,7 +76,7 @@ class LoadedBody:
         return point
 
     def axes(self, frame: int) -> Floats:
-        """(n, 3, 3) axes of a frame as columns, in the base frame."""
+        """Return the (n, 3, 3) axes of a frame as columns, in the base frame."""
         axes = self.posture.axes(frame)
         for bend in self.bent:
             if self._follows(frame, bend.frame):
@@ -79,19 +84,19 @@ class LoadedBody:
         return axes
 
     def origin_mm(self, frame: int) -> Floats:
-        """(n, 3) origin of a frame, in the base frame."""
+        """Return the (n, 3) origin of a frame in the base frame."""
         return self.place_mm(frame, np.zeros(3))
 
     def torque(self, joint: str) -> Floats:
-        """(n,) generalised force of gravity on a joint: N m or N."""
+        """Return the (n,) generalised force of gravity on a joint: N m or N."""
         return self._torque(joint, self.masses)
 
     def payload_torque(self, joint: str) -> Floats:
-        """(n,) the part of `torque` that the payload makes."""
+        """Return the (n,) part of `torque` that is due to the payload."""
         return self._torque(joint, tuple(mass for mass in self.masses if mass.is_payload))
 
     def overturning_newton_m(self) -> Floats:
-        """(n, 3) moment of all weights about the base's origin, in the base frame."""
+        """Return the (n, 3) moment of all weights about the base's origin, in the base frame."""
         total = np.zeros((len(self.growth), 3))
         for mass in self.masses:
             total += _cross(self.place_mm(mass.frame, mass.place_mm) / 1e3, self._weight_newton(mass))
@@ -106,7 +111,7 @@ class LoadedBody:
             if coefficient == 0.0:
                 continue
             if screw.turns != (self.rig.joint(joint).kind == "revolute"):
-                coefficient *= 1e3 if screw.turns else 1e-3  # rad and mm of a motion for each m and rad of its joint
+                coefficient *= 1e3 if screw.turns else 1e-3  # rad or mm of a motion per m or rad of its joint
             axis, point = self._axis(index, screw)
             for mass, place, weight in zip(masses, places, weights, strict=True):
                 if not self.posture.chain.carries(index, mass.frame):
@@ -116,7 +121,7 @@ class LoadedBody:
         return total
 
     def beam(self, row: int) -> Beam:
-        """Beam of a row's driven length `a`, with the loads on it."""
+        """Return the beam of a row's driven length `a`, with the loads on it."""
         screws = self.posture.chain.screws
         index = next(i for i, s in enumerate(screws) if s.row == row and not s.turns)
         axis, root = self.posture.axis(index)
@@ -124,7 +129,7 @@ class LoadedBody:
         carried = self.posture.shifts_mm[index + 1] - before  # pure translation along the axis
         length_mm = self.constants[row - 1].a + np.sum(carried * axis, axis=1)
         straight_tip = root + length_mm[:, None] * axis
-        # The bent tip: loads act where the beam has come to rest.
+        # The bent tip: loads act on the deflected beam
         tip = straight_tip
         for bend in self.bent:
             if self._follows(row, bend.frame):
@@ -140,7 +145,7 @@ class LoadedBody:
         return Beam(axis, length_mm / 1e3, straight_tip, force, moment, own)
 
     def turning(self, row: int) -> Turning:
-        """Axis of a row's driven angle `theta`, with the moment on it."""
+        """Return the axis of a row's driven angle `theta`, with the moment on it."""
         index, screw = next((i, s) for i, s in enumerate(self.posture.chain.screws) if s.row == row and s.turns)
         axis, place = self._axis(index, screw)
         moment = np.zeros_like(place)
@@ -154,14 +159,14 @@ class LoadedBody:
         axis, point = self.posture.axis(index)
         point = point * (1.0 + self.growth)[:, None]
         for bend in self.bent:
-            # A bend comes after its row's driven length and before its row's joint.
+            # A bend acts after its row's driven length and before its row's joint
             if self._follows(screw.row, bend.frame) and (screw.row != bend.frame or screw.turns):
                 axis = (rotation_by_vector(bend.rotation_vector) @ axis[:, :, None])[:, :, 0]
                 point = _bent(bend, point)
         return axis, point
 
     def _follows(self, frame: int, other: int) -> bool:
-        """True if a frame is another one or beyond it."""
+        """Return True if a frame is the same as `other` or beyond it."""
         return other in (0, *self.rig.path(frame))
 
     def _weight_newton(self, mass: PointMass) -> Floats:
@@ -178,7 +183,7 @@ def _bent(bend: Bend, point: Floats) -> Floats:
 
 
 def _cross(a: Floats, b: Floats) -> Floats:
-    """(n, 3) cross products of rows, a few times quicker than NumPy's for three columns."""
+    """Return the (n, 3) cross products of rows, a few times faster than NumPy's for three columns."""
     ax, ay, az = a[:, 0], a[:, 1], a[:, 2]
     bx, by, bz = b[:, 0], b[:, 1], b[:, 2]
     return np.column_stack((ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx))

@@ -22,10 +22,10 @@ class SimulatedObservations:
     """Observations of n fixes, with their true positions.
 
     Attributes:
-        columns: the observations CSV's columns, in order: name -> (n,) strings or numbers.
-        measured_mm: (n, 3) the fixes, as in x_mm, y_mm, z_mm.
-        oracle_mm: (n, 3) where the true machine has the prism *if the joints are as read*: what a perfect model
-            would predict from the same row.
+        columns: columns of the observations CSV, in order: name -> (n,) strings or numbers.
+        measured_mm: (n, 3) the fixes, the same as columns x_mm, y_mm, z_mm.
+        oracle_mm: (n, 3) positions of the prisms on the true machine at the joints' *readings*: the prediction of a
+            perfect model from the same row.
     """
 
     columns: Mapping[str, Floats | Strings]
@@ -37,11 +37,11 @@ class SimulatedObservations:
 
     @property
     def noise_rms_mm(self) -> float:
-        """RMS of the 3-D difference of measurement and oracle: no model can do better but by luck."""
+        """RMS of the 3-D difference between measurement and oracle; a model can only beat this by chance."""
         return float(np.sqrt(np.mean(np.sum((self.measured_mm - self.oracle_mm) ** 2, axis=1))))
 
     def csv_text(self) -> str:
-        """Observations CSV; numbers are written so that they read back exactly."""
+        """Return the observations as CSV; numbers are written so that they can be read back exactly."""
         out = io.StringIO()
         writer = csv.writer(out, lineterminator="\n")
         writer.writerow(self.columns)
@@ -51,12 +51,17 @@ class SimulatedObservations:
 
 
 def random_poses(rig: Rig, n: int, rng: np.random.Generator) -> dict[str, Floats]:
-    """Draw n poses evenly within the joint limits: joint name -> (n,) deg or mm."""
+    """Draw n poses uniformly within the joint limits: joint name -> (n,) deg or mm."""
     return {j.name: rng.uniform(*j.limits, n) for j in rig.joints}
 
 
 def travel_m(rig: Rig, poses: Mapping[str, Floats]) -> dict[str, Floats]:
-    """`<joint>_travel_m` of every prismatic joint -> (n,) m travelled from the first pose, visited in this order."""
+    """Return `<joint>_travel_m` -> (n,) m travelled since the first pose, for every prismatic joint.
+
+    Args:
+        rig: description of the rig.
+        poses: joint name -> (n,) mm, in the order in which the poses are visited.
+    """
     return {
         f"{j.name}_travel_m": np.cumsum(np.abs(np.diff(poses[j.name], prepend=poses[j.name][:1]))) / 1e3
         for j in rig.joints
@@ -67,14 +72,14 @@ def travel_m(rig: Rig, poses: Mapping[str, Floats]) -> dict[str, Floats]:
 def prisms_mm(
     truth: RigTruth, prism: Strings, joints: Mapping[str, Floats], columns: Mapping[str, Floats], *, setup: str = ""
 ) -> Floats:
-    """(n, 3) true positions of a prism for each row, in the station's frame.
+    """Return the (n, 3) true position of each row's prism in the station's frame.
 
     Args:
-        truth: the machine, its effects anchored in time and temperature.
-        prism: (n,) names.
+        truth: the machine, with effects anchored in time and temperature.
+        prism: (n,) names of the prisms.
         joints: joint name -> (n,) noise-free readings, deg or mm.
-        columns: further observation columns that effects need -> (n,).
-        setup: station set-up.
+        columns: name -> (n,) further observation columns that effects need.
+        setup: name of the station set-up.
     """
     out = np.empty((len(prism), 3))
     for name in np.unique(prism):

@@ -1,7 +1,7 @@
-"""Motion of the boom through a plan: every joint with limited rate and acceleration, then a standstill.
+"""Motion of the boom through a plan: each joint moves with limited rate and acceleration, then stands still.
 
-Time is simulated seconds, passed in. The past of a plan can be asked as well as its present: a measurement may belong
-to an instant a little ago.
+Times are simulated seconds. The state can be requested for the present and for the past, because a measurement may
+belong to a slightly earlier instant.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ ACCELERATION_TIME_S = 0.5  # from rest to the full rate
 
 @dataclass(frozen=True, slots=True)
 class _Ramp:
-    """One joint's way from one value to another: speed up, hold, slow down (a trapezium of the rate)."""
+    """Motion of one joint between two values: accelerate, hold, decelerate (trapezoidal rate)."""
 
     start: float
     end: float
@@ -31,7 +31,7 @@ class _Ramp:
 
     @property
     def peak(self) -> float:
-        """Rate actually reached: short ways never reach the full one."""
+        """Rate actually reached; short motions never reach the full rate."""
         return min(self.rate, math.sqrt(abs(self.distance) * self.acceleration))
 
     @property
@@ -41,11 +41,11 @@ class _Ramp:
         return abs(self.distance) / self.peak + self.peak / self.acceleration
 
     def travelled(self, elapsed_s: float) -> float:
-        """Way behind it, 0 or more."""
+        """Return the distance travelled so far, 0 or more."""
         return abs(self.at(elapsed_s)[0] - self.start)
 
     def at(self, elapsed_s: float) -> tuple[float, float]:
-        """Value and rate."""
+        """Return value and rate."""
         total = self.duration_s
         if elapsed_s >= total:
             return self.end, 0.0
@@ -67,7 +67,7 @@ class _Leg:
     end_s: float
     ramps: Mapping[str, _Ramp]
     directions: Mapping[str, int]
-    travelled: Mapping[str, float]  # by each joint, in all legs before this one
+    travelled: Mapping[str, float]  # by each joint, in all previous legs
     rested_s: float  # when the motion before this leg ended
 
 
@@ -75,11 +75,11 @@ class BoomMotion:
     """The joint values over time.
 
     Args:
-        rig: gives joints, limits and rates.
-        start: joint name -> value at the beginning, deg or mm; the middle of the limits for joints that are missing.
+        rig: description with joints, limits and rates.
+        start: joint name -> initial value, deg or mm; missing joints start in the middle of their limits.
 
     Raises:
-        ValueError: an unknown joint or a value beyond its limits.
+        ValueError: a joint is unknown, or a value is beyond its limits.
     """
 
     def __init__(self, rig: Rig, start: Mapping[str, float] | None = None) -> None:
@@ -100,23 +100,23 @@ class BoomMotion:
                 raise ValueError(f"{name} = {value} is beyond its limits {low} .. {high}")
 
     def move(self, now_s: float, target: Mapping[str, float], *, speed: float = 0.25, dwell_s: float = 0.0) -> float:
-        """Append a move: it begins when the moves before it have ended, and not before `now_s`.
+        """Append a move, which begins when the previous moves have ended, but not before `now_s`.
 
         Args:
-            now_s: this instant.
-            target: joint name -> value; joints that are missing stay.
+            now_s: current time.
+            target: joint name -> value; missing joints do not move.
             speed: share of every joint's `max_rate`, 0 < speed <= 1.
             dwell_s: standstill before the next move may begin.
 
         Returns:
-            When it will arrive (without the dwell), simulated seconds.
+            Time of arrival (without the dwell) in simulated seconds.
 
         Raises:
-            ValueError: unknown joint, value beyond its limits, impossible speed.
+            ValueError: a joint is unknown, a value is beyond its limits, or the speed is invalid.
         """
         self._check(target)
         if not 0 < speed <= 1:
-            raise ValueError(f"speed is a share of the joints' maximum rate, above 0 and at most 1, not {speed}")
+            raise ValueError(f"speed is a share of the joints' maximum rate: above 0 and at most 1, not {speed}")
         last = self._legs[-1]
         begin = max(now_s, last.end_s)
         ramps, directions = {}, dict(last.directions)
@@ -139,37 +139,37 @@ class BoomMotion:
         return self._legs[bisect_right(self._begins, t_s) - 1]
 
     def joint(self, name: str, t_s: float) -> tuple[float, float]:
-        """Value (deg, mm) and rate (deg/s, mm/s) of a joint at an instant."""
+        """Return value (deg, mm) and rate (deg/s, mm/s) of a joint at an instant."""
         leg = self._leg(t_s)
         return leg.ramps[name].at(t_s - leg.begin_s)
 
     def values(self, t_s: float) -> dict[str, float]:
-        """All joint values at an instant."""
+        """Return all joint values at an instant."""
         leg = self._leg(t_s)
         return {name: ramp.at(t_s - leg.begin_s)[0] for name, ramp in leg.ramps.items()}
 
     def directions(self, t_s: float) -> Mapping[str, int]:
-        """Direction of each joint's last motion begun by then: -1, 1, or 0 if it has not moved."""
+        """Return the direction of each joint's last motion begun up to `t_s`: -1, 1, or 0 if it has not moved."""
         return self._leg(t_s).directions
 
     def travelled(self, name: str, t_s: float) -> float:
-        """Way that a joint has gone back and forth since the beginning, deg or mm."""
+        """Return the total distance that a joint has travelled back and forth since the start, deg or mm."""
         leg = self._leg(t_s)
         return leg.travelled[name] + leg.ramps[name].travelled(t_s - leg.begin_s)
 
     def standing_s(self, t_s: float) -> float:
-        """Time since the last motion of any joint, from second 0 if there was none; 0 while one moves."""
+        """Return the time since the last motion of any joint, or since second 0; 0 while a joint moves."""
         leg = self._leg(t_s)
         longest = max(ramp.duration_s for ramp in leg.ramps.values())
         rested = leg.begin_s + longest if longest else leg.rested_s
         return max(0.0, t_s - rested)
 
     def moving(self, t_s: float) -> bool:
-        """True if any joint moves."""
+        """Return True if any joint moves."""
         leg = self._leg(t_s)
         return any(t_s - leg.begin_s < ramp.duration_s for ramp in leg.ramps.values())
 
     def forget_before(self, t_s: float) -> None:
-        """Drop what no one will ask for any more: legs that ended before `t_s`, but for the last."""
+        """Discard the legs before the one at `t_s`, which are no longer needed."""
         keep = max(0, bisect_right(self._begins, t_s) - 1)
         del self._legs[:keep], self._begins[:keep]

@@ -1,4 +1,4 @@
-"""Noise as it occurs: growing with range, shared by a standstill, wandering, with outliers; coarse encoders."""
+"""Realistic noise: growing with range, shared within a standstill, wandering, with outliers; coarse encoders."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from calibration.rig.description import Joint, Rig, Station
 Floats = NDArray[np.float64]
 
 ARCSEC = np.pi / 180 / 3600
-_LOG_OUTLIER_SIZES = float(np.log(8.0)), float(np.log(60.0))  # of their size over the noise
+_LOG_OUTLIER_SIZES = float(np.log(8.0)), float(np.log(60.0))  # of the size of outliers in units of the noise
 
 
 @dataclass(frozen=True)
@@ -21,14 +21,14 @@ class NoiseSettings:
     """Settings of the measurement noise.
 
     Attributes:
-        common_share: of the variance, common to all fixes of a standstill.
-        wander_share, wander_poses: of the variance, in an error that wanders from pose to pose (air, tripod), and over
-            how many poses it forgets.
-        excess_wander: standard deviation of a further error that wanders likewise, in units of the noise; neither the
+        common_share: share of the variance that is common to all fixes of a standstill.
+        wander_share, wander_poses: share of the variance of an error that wanders from pose to pose (air, tripod), and
+            its correlation length in poses.
+        excess_wander: standard deviation of an additional wandering error, in units of the noise; neither the
             covariance nor the stated sigma includes it.
-        outliers: share of the fixes that are 8 to 60 times the noise off.
-        encoder_step_deg: encoders read in steps of this size, whatever the rig file says; 0 as the rig file says.
-        jitter_s: standard deviation of the instant at which joints are read, against that of the fix.
+        outliers: share of the fixes with errors of 8 to 60 times the noise.
+        encoder_step_deg: resolution of the encoders, overriding the rig file; 0 for that of the rig file.
+        jitter_s: standard deviation of the time at which joints are read, relative to the fix.
     """
 
     common_share: float = 0.2
@@ -46,8 +46,8 @@ class FixNoise:
 
     Attributes:
         error_mm: (n, 3) measured minus true.
-        covariance_mm2: (n, 3, 3) of each fix, without outliers.
-        is_outlier: (n,).
+        covariance_mm2: (n, 3, 3) covariance of each fix, without outliers.
+        is_outlier: (n,) mask of the outliers.
     """
 
     error_mm: Floats
@@ -56,24 +56,24 @@ class FixNoise:
 
     @property
     def sigma_mm(self) -> Floats:
-        """(n, 3) standard deviation of each coordinate."""
+        """The (n, 3) standard deviation of each coordinate."""
         return coordinate_sigma_mm(self.covariance_mm2)
 
 
 def draw_noise(
     station: Station, true_mm: Floats, pose: NDArray[np.intp], settings: NoiseSettings, rng: np.random.Generator
 ) -> FixNoise:
-    """Noise of fixes.
+    """Draw the noise of fixes.
 
     Args:
-        station: its random errors give the noise its shape and size.
-        true_mm: (n, 3) true places in the station's frame.
-        pose: (n,) number of the standstill, rising with the time.
-        settings: see there.
-        rng: source.
+        station: random errors of the station, which determine shape and size of the noise.
+        true_mm: (n, 3) true positions in the station's frame.
+        pose: (n,) number of the standstill, increasing with time.
+        settings: see NoiseSettings.
+        rng: random generator.
 
     Raises:
-        ValueError: shares that are no shares, or a negative size.
+        ValueError: a share is not between 0 and 1, or a size is negative.
     """
     _check(settings)
     covariance = station_covariance_mm2(station, true_mm)
@@ -98,7 +98,10 @@ def draw_noise(
 
 
 def _wandering(fresh: Floats, poses: float) -> Floats:
-    """(n, 3) errors of the same variance as independent ones (n, 3), forgotten over this many poses."""
+    """Return (n, 3) correlated errors with the variance of the independent errors `fresh` (n, 3).
+
+    `poses` is the correlation length in poses.
+    """
     keep = np.exp(-1.0 / poses)
     out = np.empty_like(fresh)
     for i in range(len(fresh)):
@@ -113,14 +116,14 @@ def read_joints(
     settings: NoiseSettings,
     rng: np.random.Generator,
 ) -> dict[str, Floats]:
-    """Readings of encoders and transducers, taken a little before or after the fix.
+    """Return readings of encoders and transducers, taken slightly before or after the fix.
 
     Args:
-        rig: joints' sigma and resolution.
-        joints: joint name -> (n,) at the fix, deg or mm.
-        columns: `<joint>_rate` of each -> (n,).
-        settings: see there.
-        rng: source.
+        rig: description with the joints' sigma and resolution.
+        joints: joint name -> (n,) true value at the fix, deg or mm.
+        columns: `<joint>_rate` of each joint -> (n,).
+        settings: see NoiseSettings.
+        rng: random generator.
     """
     late_s = rng.normal(0.0, settings.jitter_s, len(next(iter(joints.values()))))
     out = {}
@@ -135,13 +138,19 @@ def read_joints(
 def _check(settings: NoiseSettings) -> None:
     shares = settings.common_share, settings.wander_share, settings.outliers
     if min(shares) < 0.0 or settings.common_share + settings.wander_share > 1.0 or settings.outliers > 1.0:
-        raise ValueError("shares of noise are from 0 to 1, those of the variance together at most 1")
+        raise ValueError("shares of noise must be from 0 to 1, and the shares of the variance together at most 1")
     if min(settings.encoder_step_deg, settings.jitter_s, settings.excess_wander) < 0.0 or settings.wander_poses <= 0.0:
-        raise ValueError("sizes of noise are not negative, and a wander lasts more than 0 poses")
+        raise ValueError("sizes of noise must not be negative, and wander_poses must be above 0")
 
 
 def read_joint(joint: Joint, values: Floats, rng: np.random.Generator) -> Floats:
-    """(n,) readings of true values by an encoder or transducer, deg or mm: with random error, in whole steps."""
+    """Return the (n,) readings of an encoder or transducer, with random error and rounded to its resolution.
+
+    Args:
+        joint: description of the joint.
+        values: (n,) true values, deg or mm.
+        rng: random generator.
+    """
     noisy = values + rng.normal(0, joint.sigma, len(values))
     if joint.resolution == 0.0:
         return noisy
@@ -150,7 +159,7 @@ def read_joint(joint: Joint, values: Floats, rng: np.random.Generator) -> Floats
 
 @dataclass(frozen=True)
 class _Sighted:
-    """Positions as a total station in the origin measures them, and the spread of each of its measurements."""
+    """Polar coordinates of positions seen from a total station at the origin, and the sigma of each measurement."""
 
     hz: Floats
     zenith: Floats
@@ -175,15 +184,15 @@ def _sighted(station: Station, true_mm: Floats) -> _Sighted:
 
 
 def _position(hz: Floats, zenith: Floats, range_: Floats | float) -> Floats:
-    """(n, 3) positions at a direction and range."""
+    """Return the (n, 3) positions at a direction and range."""
     sideways = range_ * np.sin(zenith)
     return np.column_stack([sideways * np.sin(hz), sideways * np.cos(hz), range_ * np.cos(zenith)])
 
 
 def station_covariance_mm2(station: Station, true_mm: Floats) -> Floats:
-    """(n, 3, 3) of the noise of positions (n, 3): a total station's range errs more than its circles do, or less."""
+    """Return the (n, 3, 3) covariance of the noise at (n, 3) positions, from a station's range and circle errors."""
     sighted = _sighted(station, true_mm)
-    # Directions of growing range, horizontal circle and zenith angle, each with its own spread.
+    # Directions of increasing range, horizontal circle and zenith angle, each with its own sigma
     along = _position(sighted.hz, sighted.zenith, 1.0)
     round_about = np.column_stack([np.cos(sighted.hz), -np.sin(sighted.hz), np.zeros(len(true_mm))])
     downward = np.cross(round_about, along)
@@ -195,13 +204,19 @@ def station_covariance_mm2(station: Station, true_mm: Floats) -> Floats:
 
 
 def coordinate_sigma_mm(covariance_mm2: Floats) -> Floats:
-    """(n, 3) standard deviation of each coordinate, of covariances (n, 3, 3)."""
+    """Return the (n, 3) standard deviation of each coordinate for (n, 3, 3) covariances."""
     sigma_mm: Floats = np.sqrt(np.diagonal(covariance_mm2, axis1=1, axis2=2))
     return sigma_mm
 
 
 def station_measured_mm(station: Station, true_mm: Floats, rng: np.random.Generator) -> Floats:
-    """(n, 3) positions (n, 3) as a total station in the origin measures them, with its random errors."""
+    """Return (n, 3) positions as measured by a total station at the origin, with its random errors.
+
+    Args:
+        station: random errors of the station.
+        true_mm: (n, 3) true positions in the station's frame.
+        rng: random generator.
+    """
     sighted, n = _sighted(station, true_mm), len(true_mm)
     hz, zenith = (a + rng.normal(0, sighted.sigma_angle, n) for a in (sighted.hz, sighted.zenith))
     range_mm = sighted.range_mm + rng.normal(0, 1.0, n) * sighted.sigma_range_mm

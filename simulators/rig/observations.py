@@ -1,4 +1,4 @@
-"""Observations of a simulated machine that stands still in pose after pose."""
+"""Observations of a simulated machine at standstill in a sequence of poses."""
 
 from __future__ import annotations
 
@@ -29,31 +29,31 @@ def simulate_observations(
     session: str = "",
     columns: Mapping[str, Floats] | None = None,
 ) -> SimulatedObservations:
-    """Stand still in pose after pose and measure.
+    """Measure a machine at standstill in a sequence of poses.
 
     Args:
         truth: the machine.
-        n_poses: how many poses.
+        n_poses: number of poses.
         seed: the same seed gives the same poses and noise.
-        poses: joint name -> (n_poses,) deg or mm; random within the limits when absent.
-        prisms: which prisms are measured; all of the rig's when absent.
+        poses: joint name -> (n_poses,) deg or mm; None for random poses within the limits.
+        prisms: names of the prisms to measure; None for all prisms of the rig.
         prisms_per_pose: `all` of them in each pose, or `one` in turn.
-        repeats: fixes of a prism in a pose.
-        noise_mm: standard deviation of each coordinate; the rig's station noise (angles, distance, target) when absent.
-        joint_noise: joint readings carry the rig's `sigma` and `resolution`, drawn once per pose: a standing joint
-            reads the same at each of its fixes.
-        sigma_columns: also give sigma_x_mm, sigma_y_mm, sigma_z_mm (without the joints' share).
-        setup: station set-up, also decides where the machine stands.
-        session: label.
-        columns: further columns by pose (`payload_kg`, `temperature_degC`) -> (n_poses,); one that is given here takes
-            the place of the simulated one.
+        repeats: number of fixes of a prism in a pose.
+        noise_mm: standard deviation of each coordinate; None for the rig's station noise (angles, distance, target).
+        joint_noise: joint readings have the rig's `sigma` and `resolution`. The error is drawn once per pose, so a
+            standing joint reads the same at each of its fixes.
+        sigma_columns: add columns sigma_x_mm, sigma_y_mm, sigma_z_mm (without the joints' share).
+        setup: name of the station set-up, which also determines where the machine stands.
+        session: label of the session.
+        columns: name -> (n_poses,) further columns by pose (`payload_kg`, `temperature_degC`); a column given here
+            replaces the simulated one.
 
     Returns:
         Columns `prism`, the joints, x, y, z, `pose`, `time_s`, `dwell_s`, `<joint>_dir`, `<joint>_rate` (0), and
-        `setup`, `session` where given. Effects count time from the first row, and temperature from the mean.
+        `setup`, `session` if given. Effects count time from the first row, and temperature from the mean.
 
     Raises:
-        KeyError: unknown prism.
+        KeyError: a prism is unknown.
         ValueError: an effect of the machine needs a column that is missing.
     """
     rig, rng = truth.rig, np.random.default_rng([seed, 10])
@@ -73,7 +73,7 @@ def simulate_observations(
     shot = np.tile(np.arange(turns * repeats), n_poses)
 
     prism_column: Strings = np.array(names, dtype=np.str_)[which]
-    # One fix a second in a pose; dwell counts from the end of the motion to the fix.
+    # One fix per second in a pose; the dwell is the time from the end of the motion to the fix
     by_row = {k: v[pose] + (shot if k in ("time_s", "dwell_s") else 0.0) for k, v in by_pose.items()}
     seen = by_row | {k: v[pose] for k, v in travel_m(rig, held).items()}
     anchored = anchored_truth(truth, seen)
@@ -101,7 +101,12 @@ def simulate_observations(
 
 
 def anchored_truth(truth: RigTruth, columns: Mapping[str, Floats]) -> RigTruth:
-    """A machine whose effects count time from the first of these rows, and temperature from their mean."""
+    """Return the machine with effects that count time from the first of the rows, and temperature from their mean.
+
+    Args:
+        truth: the machine.
+        columns: observation columns, name -> (n,); `time_s` and `temperature_degC` are used.
+    """
     if not truth.effects:
         return truth
     first_s = float(np.min(columns.get("time_s", np.zeros(1))))
@@ -112,7 +117,7 @@ def anchored_truth(truth: RigTruth, columns: Mapping[str, Floats]) -> RigTruth:
 def _approach(
     rig: Rig, held: Mapping[str, Floats], before: Mapping[str, Floats], rng: np.random.Generator
 ) -> dict[str, Floats]:
-    """By pose: when its first fix comes, how long it has stood, and from which side each joint came."""
+    """Return columns by pose: time and dwell of the first fix, and direction from which each joint arrived."""
     steps = {name: np.diff(values, prepend=before[name]) for name, values in held.items()}
     travel_s = np.max([np.abs(steps[j.name]) / (0.25 * j.max_rate) for j in rig.joints], axis=0)
     dwell_s = rng.uniform(5.0, 60.0, len(travel_s))

@@ -1,11 +1,11 @@
 """Kinematics as a product of exponentials: home screws and home frames, derived from a rig's rows.
 
-A row is a chain of elementary transforms; where a joint drives one of them, the chain is cut and the driven motion
-becomes a screw in the base frame at home (all joint values zero):
+A row is a chain of elementary transforms. A transform that a joint drives becomes a screw in the base frame at home
+(all joint values zero):
 
     T_f(q) = exp(S_1 m_1) ... exp(S_k m_k) M_f,   m_i = sum over joints of coefficient * joint value
 
-over the motions that carry frame f. Lengths are mm, angles rad. (Lynch & Park, Modern Robotics, ch. 4)
+with the product over the motions that carry frame f. Lengths are mm, angles rad. (Lynch & Park, Modern Robotics, ch. 4)
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ Floats = NDArray[np.float64]
 
 _AXES = {"x": np.array([1.0, 0.0, 0.0]), "y": np.array([0.0, 1.0, 0.0]), "z": np.array([0.0, 0.0, 1.0])}
 
-# Which elementary transforms a row consists of, in order: (kind, axis, name of the row's constant).
+# Elementary transforms of a row, in order: (kind, axis, name of the row's constant)
 _ORDER: Mapping[Convention, Sequence[tuple[str, str, str]]] = {
     "mdh_beta_after": (
         ("move", "x", "a"),
@@ -51,7 +51,7 @@ _ORDER: Mapping[Convention, Sequence[tuple[str, str, str]]] = {
 
 @dataclass(frozen=True)
 class RowConstants:
-    """A row's constants: rad and mm."""
+    """A row's constants in rad and mm."""
 
     alpha: float
     a: float
@@ -66,13 +66,13 @@ class Screw:
     """One driven motion, in the base frame at home.
 
     Attributes:
-        row: number of the row that it belongs to, from 1.
+        row: number of its row, from 1.
         turns: True for a rotation about `axis` through `point_mm`, False for a translation along `axis`.
         axis: (3,) unit vector.
         point_mm: (3,) a point on the axis.
-        weights: joint name -> rad or mm of the motion for each rad or mm of the joint's value.
-        start: (4, 4) home pose of the frame in which the motion acts; its origin is where a driven length begins.
-        before: number of the motion that carries this one, from 1; 0 for none. Rows may branch.
+        weights: joint name -> rad or mm of the motion per rad or mm of the joint's value.
+        start: (4, 4) home pose of the frame in which the motion acts; a driven length begins at its origin.
+        before: number of the motion that carries this one, from 1; 0 if there is none. Rows may branch.
     """
 
     row: int
@@ -90,8 +90,8 @@ class ScrewChain:
 
     Attributes:
         screws: the driven motions.
-        homes: (rows + 1) x (4, 4).
-        last_screw: for each frame the number of the last motion that carries it, from 1; 0 for none.
+        homes: (rows + 1) x (4, 4) home poses.
+        last_screw: for each frame the number of the last motion that carries it, from 1; 0 if there is none.
     """
 
     screws: tuple[Screw, ...]
@@ -99,7 +99,7 @@ class ScrewChain:
     last_screw: tuple[int, ...]
 
     def carries(self, screw: int, frame: int) -> bool:
-        """True if motion number `screw` (from 0) moves a frame."""
+        """Return True if motion number `screw` (from 0) moves a frame."""
         motion = self.last_screw[frame]
         while motion > screw + 1:
             motion = self.screws[motion - 1].before
@@ -107,7 +107,7 @@ class ScrewChain:
 
 
 def nominal_constants(rig: Rig) -> tuple[RowConstants, ...]:
-    """The constants of every row as the rig file has them, in rad and mm."""
+    """Return the constants of every row from the rig file, in rad and mm."""
     deg = np.pi / 180
     return tuple(
         RowConstants(r.alpha_deg * deg, r.a_mm, r.d_mm, r.theta_deg * deg, r.beta_deg * deg, r.b_mm) for r in rig.rows
@@ -115,7 +115,7 @@ def nominal_constants(rig: Rig) -> tuple[RowConstants, ...]:
 
 
 def rotation(axis: Floats, angle: Floats) -> Floats:
-    """Rotations (n, 3, 3) about a unit vector (3,) or unit vectors (n, 3) by `angle` (n,) rad (Rodrigues)."""
+    """Return (n, 3, 3) rotations about a (3,) unit vector or (n, 3) unit vectors by (n,) angles in rad (Rodrigues)."""
     axis = np.broadcast_to(axis, (len(angle), 3))
     x, y, z = axis[:, 0], axis[:, 1], axis[:, 2]
     s, c = np.sin(angle), np.cos(angle)
@@ -134,7 +134,7 @@ def rotation(axis: Floats, angle: Floats) -> Floats:
 
 
 def rotation_by_vector(vector: Floats) -> Floats:
-    """Rotations (n, 3, 3) by rotation vectors (n, 3): direction is the axis, length the angle in rad."""
+    """Return (n, 3, 3) rotations by (n, 3) rotation vectors: the direction is the axis, the length the angle in rad."""
     angle = np.linalg.norm(vector, axis=1)
     axis = vector / np.where(angle > 0, angle, 1.0)[:, None]
     return rotation(axis, angle)
@@ -158,12 +158,12 @@ def _fixed(before: FixedTransform) -> Floats:
 
 
 def screw_chain(rig: Rig, constants: Sequence[RowConstants]) -> ScrewChain:
-    """Home screws and frames of a machine with these constants.
+    """Return the home screws and frames of a machine with given constants.
 
     Args:
-        rig: gives the order of the elementary transforms in a row, the fixed transforms and what drives what; the
-            constants of its rows are not used.
-        constants: the machine's own, one per row.
+        rig: description with the order of the elementary transforms in a row, the fixed transforms and the joints that
+            drive each row; the constants of its rows are not used.
+        constants: constants of the machine, one per row.
     """
     radians = {joint.name: np.pi / 180 if joint.kind == "revolute" else 1.0 for joint in rig.joints}
     screws: list[Screw] = []
@@ -179,7 +179,7 @@ def screw_chain(rig: Rig, constants: Sequence[RowConstants]) -> ScrewChain:
             if name in driven:
                 direction = pose[:3, :3] @ _AXES[axis]
                 point = pose[:3, 3].copy()
-                # A rig file counts in deg and mm.
+                # A rig file uses deg and mm
                 unit = np.pi / 180 if kind == "turn" else 1.0
                 weights = {joint: float(c * (unit / radians[joint])) for joint, c in driven[name].items()}
                 screws.append(Screw(number, kind == "turn", direction, point, weights, pose.copy(), motion))
@@ -196,8 +196,8 @@ class Posture:
 
     Attributes:
         chain: the machine.
-        rotations, shifts_mm: for each motion the product of its exponential and all that carry it, (n, 3, 3) and
-            (n, 3), after the identity for none.
+        rotations, shifts_mm: first the identity, then for each motion the product of its exponential and those of all
+            motions that carry it, (n, 3, 3) and (n, 3).
     """
 
     chain: ScrewChain
@@ -205,7 +205,7 @@ class Posture:
     shifts_mm: list[Floats] = field(default_factory=list)
 
     def point_mm(self, frame: int, place_mm: Floats) -> Floats:
-        """(n, 3) position in the base frame of a point fixed to `frame`, given (3,) in that frame."""
+        """Return the (n, 3) position in the base frame of a point fixed to `frame` at (3,) `place_mm`."""
         home = self.chain.homes[frame]
         at_home = home[:3, :3] @ place_mm + home[:3, 3]
         k = self.chain.last_screw[frame]
@@ -213,24 +213,24 @@ class Posture:
         return moved
 
     def axes(self, frame: int) -> Floats:
-        """(n, 3, 3) axes of `frame` as columns, in the base frame."""
+        """Return the (n, 3, 3) axes of `frame` as columns, in the base frame."""
         turned: Floats = self.rotations[self.chain.last_screw[frame]] @ self.chain.homes[frame][:3, :3]
         return turned
 
     def axis(self, screw: int) -> tuple[Floats, Floats]:
-        """(n, 3) direction and (n, 3) point of screw number `screw` (from 0), carried along by those before it."""
+        """Return (n, 3) direction and (n, 3) point of screw number `screw` (from 0), moved by the screws before it."""
         s = self.chain.screws[screw]
         R, t = self.rotations[s.before], self.shifts_mm[s.before]
         return R @ s.axis, R @ s.point_mm + t
 
 
 def pose_chain(chain: ScrewChain, joints: Mapping[str, Floats], further: Mapping[int, Floats] | None = None) -> Posture:
-    """Multiply the exponentials.
+    """Return the posture at n sets of joint values by multiplying the exponentials.
 
     Args:
         chain: the machine.
         joints: joint name -> (n,) values, rad or mm.
-        further: number of a screw (from 0) -> (n,) further motion beyond that of the joints, rad or mm.
+        further: number of a screw (from 0) -> (n,) motion in addition to that of the joints, rad or mm.
     """
     further = further or {}
     n = len(next(iter(joints.values())))

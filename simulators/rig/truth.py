@@ -1,7 +1,7 @@
-"""The machine behind a rig description: the same shape, its own parameters, and imperfections that no rig file names.
+"""The machine behind a rig description: the same structure, its own parameters, and imperfections not in any rig file.
 
-Written apart from the calibration's kinematics on purpose: a product of exponentials in place of multiplied rows, and
-effects of its own, so that a mistake in one cannot hide behind the same mistake in the other.
+It is deliberately independent of the calibration's kinematics: it uses a product of exponentials instead of multiplied
+rows, and its own effects, so that a mistake in one is not hidden by the same mistake in the other.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ Floats = NDArray[np.float64]
 
 STANDARD_GRAVITY = 9.80665  # m/s^2
 MASS_UNCERTAINTY = 0.15  # the rig file's masses are within +-15 % of the machine's
-TILT_SIGMA_DEG = 0.5  # a carrier on its jacks
-_ROUNDS = 4  # at most, of the fixed point load -> deflection -> load; each gains two to three digits
+TILT_SIGMA_DEG = 0.5  # tilt of a carrier on its jacks
+_ROUNDS = 4  # most iterations of the fixed point load -> deflection -> load; each gains two to three digits
 
 
 @dataclass(frozen=True)
@@ -47,39 +47,39 @@ class Placement:
     position_mm: Floats
 
     def to_station_mm(self, points_mm: Floats) -> Floats:
-        """(n, 3) points of the base frame, in the station's frame."""
+        """Transform (n, 3) points from the base frame to the station's frame."""
         moved: Floats = points_mm @ self.rotation.T + self.position_mm
         return moved
 
 
 def load_rig(name_or_path: str) -> Rig:
-    """Return a shipped rig by its name, or any rig by the path of its file; RigError if there is none."""
+    """Return a shipped rig by name, or a rig by the path of its file; RigError if there is none."""
     if name_or_path in shipped_rigs():
         return shipped_rig(name_or_path)
     try:
         return parse_rig(Path(name_or_path).read_text(encoding="utf-8"), name_or_path)
     except (OSError, UnicodeDecodeError) as error:
         shipped = ", ".join(shipped_rigs())
-        raise RigError(name_or_path, "", f"no shipped rig ({shipped}) and not to be read as a file: {error}") from error
+        raise RigError(name_or_path, "", f"not a shipped rig ({shipped}) and not a readable file: {error}") from error
 
 
 class RigTruth:
     """A true machine.
 
     Attributes:
-        rig: the description that it deviates from.
+        rig: the description, from which the machine deviates.
         effects: its hidden effects.
         constants: its true row constants.
 
     Args:
         rig: the description.
         seed: the same seed builds the same machine.
-        perturbation: deviation in build tolerances (and in mass uncertainties); 0 is the nominal
-            machine. A prism whose offset is unknown is drawn from its own tolerance whatever the perturbation.
+        perturbation: deviation in units of build tolerances (and of mass uncertainties); 0 gives the nominal machine. A
+            prism with an unknown offset is always drawn with its full tolerance.
         effects: hidden effects.
 
     Raises:
-        ValueError: an effect that this rig has no place for.
+        ValueError: an effect has no place on this rig.
     """
 
     def __init__(self, rig: Rig, seed: int, *, perturbation: float = 1.0, effects: Sequence[Effect] = ()) -> None:
@@ -111,13 +111,13 @@ class RigTruth:
             kg = mass.kg * (1.0 + perturbation * rng.uniform(-MASS_UNCERTAINTY, MASS_UNCERTAINTY))
             if mass.centre_mm is not None:
                 masses.append(PointMass(mass.frame, np.array(mass.centre_mm), kg, mass.payload))
-            else:  # midway between two origins: half of it at each gives the same force, moment and energy
+            else:  # midway between two origins: half at each gives the same force, moment and energy
                 origins = (mass.frame, mass.frame + 1)
                 masses.extend(PointMass(frame, np.zeros(3), kg / 2, mass.payload) for frame in origins)
         return tuple(masses)
 
     def prism_offset_mm(self, name: str) -> Floats:
-        """(3,) true place of a prism in its frame; KeyError if there is no such prism."""
+        """Return the (3,) true position of a prism in its frame; KeyError if it is unknown."""
         return self._prisms[name][1]
 
     @property
@@ -126,7 +126,7 @@ class RigTruth:
         return self._masses
 
     def placement(self, setup: str = "") -> Placement:
-        """Pose of the machine in the frame of a station set-up: a few metres away, swinging away from it."""
+        """Return the machine's pose in the frame of a station set-up: a few metres away, facing away from it."""
         if setup not in self._placements:
             self._placements[setup] = self._place(np.random.default_rng([self.seed, 3, zlib.crc32(setup.encode())]))
         return self._placements[setup]
@@ -137,7 +137,7 @@ class RigTruth:
         yaw = rotation_by_vector(np.array([[0.0, 0.0, rng.uniform(0, 2 * np.pi)]]))[0]
         tilt = rotation_by_vector(np.array([[*np.deg2rad(rng.normal(0, TILT_SIGMA_DEG, 2)), 0.0]]))[0]
         R = tilt @ yaw @ upright
-        # The middle of the work volume, seen from the base, gives reach and working direction.
+        # The middle of the work volume, relative to the base, gives reach and working direction
         middle = {j.name: np.array([sum(j.limits) / 2]) for j in self.rig.joints}
         prisms = [self._solve(middle, {}, setup=None).place_mm(*self._prisms[p])[0] for p in self.rig.prism_names]
         outward = R @ np.mean(prisms, axis=0)
@@ -150,17 +150,17 @@ class RigTruth:
     def prism_mm(
         self, name: str, joints: Mapping[str, Floats], columns: Mapping[str, Floats] | None = None, *, setup: str = ""
     ) -> Floats:
-        """(n, 3) true position of a prism in the station's frame.
+        """Return the (n, 3) true position of a prism in the station's frame.
 
         Args:
-            name: prism.
+            name: name of the prism.
             joints: joint name -> (n,) noise-free readings of encoders and transducers, deg or mm.
-            columns: further observation columns that effects need (`theta4_dir`, `payload_kg`, ...) -> (n,).
-            setup: station set-up.
+            columns: name -> (n,) further observation columns that effects need (`theta4_dir`, `payload_kg`, ...).
+            setup: name of the station set-up.
 
         Raises:
-            KeyError: no such prism, or a joint is missing.
-            ValueError: an effect needs a column that was not given.
+            KeyError: the prism is unknown, or a joint is missing.
+            ValueError: an effect needs a column that is missing.
         """
         frame, place = self._prisms[name]
         body = self._solve(joints, columns or {}, setup)
@@ -175,23 +175,23 @@ class RigTruth:
     def gravity_load(
         self, joint: str, joints: Mapping[str, Floats], columns: Mapping[str, Floats] | None = None, *, setup: str = ""
     ) -> Floats:
-        """(n,) generalised gravity force on a joint, N m or N; positive drives the joint's value up.
+        """Return the (n,) generalised gravity force on a joint, N m or N; positive increases the joint's value.
 
         Args:
-            joint: its name.
+            joint: name of the joint.
             joints: joint name -> (n,) noise-free readings, deg or mm.
-            columns: `payload_kg` where the payload differs from the rig description's.
-            setup: station set-up.
+            columns: `payload_kg` -> (n,) if the payload differs from the rig description's.
+            setup: name of the station set-up.
         """
         loose = replace_effects(self, ()) if self.effects else self
         return loose._solve(joints, columns or {}, setup).torque(joint)
 
     def row_moment(self, row: int, joints: Mapping[str, Floats]) -> Floats:
-        """(n, 3) moment of all weights that turn with a row about the place where it turns, N m, in the base frame.
+        """Return the (n, 3) moment, in the base frame in N m, of all weights that turn with a row about its axis point.
 
         Args:
-            row: its number; `theta` of it is driven.
-            joints: as for `gravity_load`.
+            row: number of the row, whose `theta` must be driven.
+            joints: joint name -> (n,) noise-free readings, deg or mm.
         """
         loose = replace_effects(self, ()) if self.effects else self
         return loose._solve(joints, {}, "").turning(row).moment_newton_m
@@ -234,7 +234,7 @@ class RigTruth:
         return body
 
     def _at_the_fix(self, body: LoadedBody) -> dict[str, Floats]:
-        """Readings at the instant of the fix, from readings taken a little later."""
+        """Return the readings at the instant of the fix, computed from readings taken slightly later."""
         delays = [delay for effect in self.effects if (delay := effect.delay_s(body)) is not None]
         read = dict(body.read)
         if delays:
@@ -245,12 +245,12 @@ class RigTruth:
         return read
 
     def _screw_turns(self, turns: Mapping[int, Floats]) -> dict[int, Floats]:
-        """Row number -> angle, as number of the row's turning motion -> angle."""
+        """Convert row number -> angle to number of the row's turning motion -> angle."""
         return {i: turns[s.row] for i, s in enumerate(self._chain.screws) if s.turns and s.row in turns}
 
 
 def replace_effects(truth: RigTruth, effects: Sequence[Effect]) -> RigTruth:
-    """Return the same machine with other hidden effects; ValueError as for `RigTruth`."""
+    """Return the same machine with different hidden effects; ValueError as in `RigTruth`."""
     for effect in effects:
         effect.check(truth.rig)
     other = object.__new__(RigTruth)
@@ -272,10 +272,10 @@ def _perturbed(own: RowConstants, row: Row, rig: Rig, draw: Floats) -> RowConsta
 
 
 def _turn_onto(source: Floats, target: Floats) -> Floats:
-    """The shortest rotation that takes one unit vector onto another."""
+    """Return the shortest rotation that maps one unit vector to another."""
     cross, cosine = np.cross(source, target), float(source @ target)
     sine = float(np.linalg.norm(cross))
-    if sine < 1e-12:  # parallel, or upside down: any axis across will do
+    if sine < 1e-12:  # parallel or opposite: any perpendicular axis is suitable
         across = np.cross(source, [1.0, 0.0, 0.0] if abs(source[0]) < 0.9 else [0.0, 1.0, 0.0])
         cross, sine = across, float(np.linalg.norm(across))
         vector = np.zeros(3) if cosine > 0 else cross / sine * np.pi

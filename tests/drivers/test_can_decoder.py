@@ -209,7 +209,7 @@ def test_a_boot_up_is_no_heartbeat_yet_but_a_sign_of_life() -> None:
 def test_a_heartbeat_that_is_none_is_a_failure() -> None:
     (failure,) = feed(decoder(), "720 42")
     assert isinstance(failure, DecodeFailure)
-    assert failure.reason == "node 32: 42h is no NMT state (00, 04, 05, 7F)"
+    assert failure.reason == "node 32: 42h is not an NMT state (00, 04, 05, 7F)"
 
 
 def test_emergency_of_the_protocol_facts_voids_the_values_until_it_is_taken_back() -> None:
@@ -245,7 +245,7 @@ def test_errors_are_gone_only_with_the_last_bit_of_the_register(left: str) -> No
     feed(boom, "0A0 10 81 11 00 00 00 00 00")
     (event,) = events(feed(boom, f"0A0 00 00 {left} 00 00 00 00 00"))
     assert (event.kind, event.code) == (EventKind.EMERGENCY, None), "code 0 would take it back"
-    assert "an error is gone, others are left" in event.text
+    assert "one error has cleared, others remain" in event.text
     assert the_reading(feed(boom, "1A0 00 40 00 00")).status is Status.DEVICE_ALARM
     assert kinds(feed(boom, "0A0 00 00 00 00 00 00 00 00")) == [EventKind.EMERGENCY_CLEARED]
     assert the_reading(feed(boom, "1A0 00 40 00 00")).value == 90.0

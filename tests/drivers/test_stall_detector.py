@@ -62,7 +62,9 @@ def test_bytes_of_a_station_that_nobody_read_in_time_are_stored_and_marked(tmp_p
         collected.wait_for_bytes(16)
     assert collected.received_bytes() == b"in timelateagain"
     assert [c.data for c in collected.captures() if c.stamp.is_doubtful] == [b"late"]
-    assert told.text.startswith("station: 4 bytes are stored, but marked, as their time is doubtful: nobody read")
+    assert told.text.startswith(
+        "station: 4 bytes are stored but not used for calibration, as their time is doubtful: the port"
+    )
     assert collected.events(EventKind.FRAMES_DROPPED) == []
     (gap,) = collected.gaps()
     assert gap.reason is GapReason.TIME_DOUBTFUL
@@ -89,7 +91,8 @@ def test_a_fix_whose_record_nobody_read_in_time_is_not_used(tmp_path: Path) -> N
     assert [fix.status for fix in fixes] == [Status.OK, Status.TIME_DOUBTFUL, Status.OK]
     assert fixes[1].slope_distance_m == pytest.approx(30.0)  # what was measured is kept
     assert fixes[1].reason == (
-        "its time is doubtful: nobody read for a while: rigcal was stopped, or the computer too busy"
+        "its time is doubtful: the port was not read for a while, because rigcal was stopped or the computer was "
+        "too busy"
     )
     assert position_mm(fixes[1]) is None
     assert not any(isinstance(r, DeviceEvent) and r.kind is EventKind.PRISM_JUMP for r in records)

@@ -209,9 +209,9 @@ class TestFaults:
     @pytest.mark.parametrize(
         ("text", "message"),
         [
-            ("node_silent@1:node=99", "this rig has no node 99; it has 32, 33"),
+            ("node_silent@1:node=99", "this rig has no node 99; nodes: 32, 33"),
             ("prism_jump@1:to=q", "no prism 'q'; this rig has w, b, r, s"),
-            ("preset_jump@1:node=60", "node 60 is no encoder or length transducer"),
+            ("preset_jump@1:node=60", "node 60 is not an encoder or length transducer"),
         ],
     )
     def test_a_fault_of_a_part_that_is_not_there_is_refused_at_once(self, text: str, message: str) -> None:
@@ -224,7 +224,7 @@ class TestFaults:
         assert all(isinstance(c, SerialCapture) for c in got.captures)
         with pytest.raises(ValueError, match="no machine signals"):
             record(rig, faults="counter_gap@1")
-        with pytest.raises(ValueError, match="it has none"):
+        with pytest.raises(ValueError, match="nodes: none"):
             record(rig, faults="node_reboot@1")
 
 
@@ -258,5 +258,5 @@ scale = 0.01
 def test_a_machine_of_another_dbc_is_refused(odd_rig_text: str) -> None:
     channel = '[[channel]]\nname = "p"\ndevice = "dbc"\nunit = "bar"\ndbc = "x.dbc"\nmessage = "M"\nsignal = "S"\n'
     rig = parse_rig(odd_rig_text.format(convention="dh") + channel, "odd.toml")
-    with pytest.raises(ValueError, match=r"channel p: the simulated machine speaks machine.dbc, not x.dbc"):
+    with pytest.raises(ValueError, match=r"channel p: the simulated machine only sends machine.dbc, not x.dbc"):
         RigSimulator(RigTruth(rig, 1), 1)

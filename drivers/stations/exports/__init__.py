@@ -1,4 +1,4 @@
-"""The registry of formats that instruments and their programs export: the `FORMAT` of every file in this folder."""
+"""The registry of export formats of instruments and their programs: the `FORMAT` of every file in this directory."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ def format_of(text: str, source: str) -> ExportFormat:
     """Return the format of a text.
 
     Raises:
-        DescriptionError: it is of none.
+        DescriptionError: no format recognises the text.
     """
     for known in export_formats().values():
         if known.recognises(text):
             return known
-    refuse(source, f"the format is not known; known: {', '.join(known.title for known in export_formats().values())}")
+    refuse(source, f"unknown format; known: {', '.join(known.title for known in export_formats().values())}")

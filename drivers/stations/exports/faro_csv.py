@@ -1,4 +1,4 @@
-"""Text exports of FARO trackers and CAM2: a name and X, Y, Z below a preamble with units."""
+"""Text exports of FARO trackers and CAM2: a preamble with units, then a name and X, Y, Z per line."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tables of any origin: a header that names coordinates, or angles and a slope distance; or point, x, y, z alone."""
+"""Tables of any origin: with a header that names coordinates, or angles and slope distance; or just point, x, y, z."""
 
 from __future__ import annotations
 

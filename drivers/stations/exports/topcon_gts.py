@@ -1,10 +1,10 @@
-"""Downloads of a Topcon GTS-200 series' memory (docs/reference/protocols.md): blocks with check sums, records in them.
+"""Downloads of the memory of Topcon GTS-200 series stations (docs/reference/protocols.md): records in checked blocks.
 
-    file   = { STX, 128 characters, number of the block 0 to 9, three digits of block check, ETX, line end }, EOT
+    file   = { STX, 128 characters, block number 0 to 9, three digits of block check, ETX, line end }, EOT
     check  = XOR of the characters and the number
     fields = _' job   _( instrument   _) its height   _+ point   _<blank> record   _* code   _, height of the target
 
-A record is the `?` record that the instrument sends over its line, with its own block check.
+A record is the same `?` record that the instrument sends on its serial line, with its own block check.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def _guess(text: str, source: str) -> Guess:
     fixes = _read(text, ColumnMap(format=FORMAT.name), source)
     codes = sorted({fix.target for fix in fixes if fix.target})
     told = f"codes {', '.join(codes)}" if codes else "no codes"
-    notes = (f"{len(fixes)} records of points, with {told}; positions are computed from slope distance and circles",)
+    notes = (f"{len(fixes)} records of points, with {told}; positions are computed from slope distance and angles",)
     return Guess(ColumnMap(format=FORMAT.name), notes)
 
 
@@ -40,7 +40,11 @@ def _read(text: str, columns: ColumnMap, source: str) -> list[ExportedFix]:  # n
     joined, lines = _blocks(text, source)
     joined = joined.rstrip(" ")  # the last block is padded
     if not joined.endswith("_"):
-        refuse(source, "the download ends within a field: blocks are missing", lines[-1] if lines else None)
+        refuse(
+            source,
+            "the download ends within a field, so blocks are missing; download the file again",
+            lines[-1] if lines else None,
+        )
     joined = joined[:-1]
     fixes: list[ExportedFix] = []
     point, target, stood = "", "", {"'": "", "(": "", ")": ""}
@@ -49,7 +53,7 @@ def _read(text: str, columns: ColumnMap, source: str) -> list[ExportedFix]:  # n
     for match in _FIELD.finditer(joined):
         line = lines[match.start() // 128]
         if match.start() != end:
-            refuse(source, f"{joined[end : match.start()][:20]!r} belongs to no field", line)
+            refuse(source, f"{joined[end : match.start()][:20]!r} does not belong to any field", line)
         end = match.end()
         value = match["value"]
         match match["kind"]:
@@ -68,15 +72,15 @@ def _read(text: str, columns: ColumnMap, source: str) -> list[ExportedFix]:  # n
                 if target and fixes and fixes[-1].point == point:
                     fixes[-1] = replace(fixes[-1], target=target)
     if joined[end:].strip():
-        refuse(source, f"{joined[end:].strip()[:20]!r} belongs to no field", lines[-1])
+        refuse(source, f"{joined[end:].strip()[:20]!r} does not belong to any field", lines[-1])
     if not fixes:
-        refuse(source, "the download has no record of a point")
+        refuse(source, "the download has no point records")
     return fixes
 
 
 def _fix(record: str, point: str, line: int, source: str) -> ExportedFix:
     if not point:
-        refuse(source, f"a record without a point: {record!r}", line)
+        refuse(source, f"record without a point: {record!r}", line)
     data = decode_frame(record.strip().encode("latin-1"))
     if data is None:
         refuse(source, f"the block check of the record of point {point} is wrong: {record!r}", line)
@@ -86,12 +90,12 @@ def _fix(record: str, point: str, line: int, source: str) -> ExportedFix:
         refuse(source, f"point {point}: {error}", line)
     place = position_mm(found)
     if place is None:
-        refuse(source, f"point {point}: {found.reason or 'the record has no position'}; leave it out of the file", line)
+        refuse(source, f"point {point}: {found.reason or 'the record has no position'}; remove it from the file", line)
     return ExportedFix(line, point, "", place, prism_constant_mm=found.prism_constant_mm)
 
 
 def _blocks(text: str, source: str) -> tuple[str, list[int]]:
-    """Return the data of all blocks, joined, and the line of each block."""
+    """Return the joined data of all blocks and the line number of each block."""
     data: list[str] = []
     lines: list[int] = []
     has_ended = False
@@ -103,14 +107,19 @@ def _blocks(text: str, source: str) -> tuple[str, list[int]]:
             has_ended = True
             continue
         if has_ended:
-            refuse(source, "a block after the end of the transmission", number)
+            refuse(source, "a block follows the end of the transmission; save each download as a separate file", number)
         match = _BLOCK.fullmatch(block)
         if match is None:
             refuse(source, f"{len(block)} characters; a block has 128, its number and three digits", number)
         if block_check((match["data"] + match["number"]).encode()) != match["check"].encode():
             refuse(source, f"the block check is wrong: {match['check']}; download the file again", number)
         if int(match["number"]) != len(data) % 10:
-            refuse(source, f"block {match['number']} where block {len(data) % 10} is due: one is missing", number)
+            refuse(
+                source,
+                f"found block {match['number']}, expected block {len(data) % 10}: a block is missing; "
+                "download the file again",
+                number,
+            )
         data.append(match["data"])
         lines.append(number)
     return "".join(data), lines

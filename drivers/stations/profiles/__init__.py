@@ -1,4 +1,4 @@
-"""The registry of station profiles: the `PROFILE` of every file in this folder."""
+"""The registry of station profiles: the `PROFILE` of every file in this directory."""
 
 from __future__ import annotations
 
@@ -21,5 +21,5 @@ def station_profiles() -> dict[str, StationProfile]:
 
 
 def codecs_by_family() -> dict[str, Codec]:
-    """Return the protocols that a passive listener can be told to expect, by the name of their family."""
+    """Return the protocols that a passive listener can use, by the name of their family."""
     return {profile.codec.family: profile.codec for profile in station_profiles().values() if profile.codec}

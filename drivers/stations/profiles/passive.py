@@ -1,4 +1,4 @@
-"""Profile `passive`: listens to an instrument that another program controls, and sends nothing, ever."""
+"""Profile `passive`: listens to an instrument that another program controls, and never sends anything."""
 
 from __future__ import annotations
 

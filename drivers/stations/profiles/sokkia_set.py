@@ -1,7 +1,7 @@
-"""Profile `sokkia_set`: Sokkia's SET command family, newer Topcon stations too.
+"""Profile `sokkia_set`: Sokkia's SET command family, which newer Topcon stations also use.
 
-When the last measuring mode in `init` repeats (Xb, Xd, Xe), one 11h starts a stream of replies; it is sent again only
-when the stream has stopped for `reply_timeout_s`, and 12h ends it when the link closes.
+If the last measuring mode in `init` is a repeating one (Xb, Xd, Xe), one 11h starts a stream of replies. It is sent
+again only if the stream has stopped for `reply_timeout_s`, and 12h ends the stream when the link closes.
 """
 
 from __future__ import annotations
@@ -10,13 +10,13 @@ from drivers.stations.poller import CommandPlan
 from drivers.stations.profile import ProfileOptions, StationProfile
 from drivers.stations.sokkia.codec import CODEC
 
-# 11H and 12H in the manuals: hexadecimal codes of single characters, as 06H (ACK) and 0DH (CR) are there.
+# 11H and 12H in the manuals: hexadecimal codes of single characters, like 06H (ACK) and 0DH (CR) there
 REQUEST_DISTANCE = b"\x11"
 STOP = b"\x12"
 TRACKING = "Xe"
 REPEATING = ("Xb", "Xd", TRACKING)  # fine repeat, rapid repeat, tracking
 MEASURING_MODES = ("Xa", "Xc", *REPEATING)
-PAUSE_S = 0.7  # SET600: the next command comes this long after ACK or NAK
+PAUSE_S = 0.7  # SET600: pause after ACK or NAK before the next command
 
 
 def _plan(options: ProfileOptions) -> CommandPlan:

@@ -1,4 +1,4 @@
-"""Profile `topcon_classic`: single shots with C; the host acknowledges each record."""
+"""Profile `topcon_classic`: single measurements with C; the host acknowledges each record."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""Sokkia total stations and the newer Topcon ones of the same command family: the SET two-way protocol."""
+"""The SET two-way protocol of Sokkia total stations and of newer Topcon stations."""

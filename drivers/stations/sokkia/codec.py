@@ -1,11 +1,11 @@
-"""Sokkia SET two-way protocol, of newer Topcon stations too: lines, checksums, records, errors.
+"""Sokkia SET two-way protocol, also of newer Topcon stations: lines, checksums, records, errors.
 
     SSSSSSS VVVVVVV HHHHHHH [SUM] CR LF     slope distance in mm, zenith and horizontal angle DDDMMSS
 
-A field that the instrument cannot give reads Exxx. SUM, if the instrument is set to send it, is the sum of all bytes
-before it modulo 256 as two upper-case hexadecimal digits; a reply that carries one must have the right one. Settings
-are answered by a single 06h (done) or 15h (refused). The reply does not name its units: the instrument must be set to
-metres, degrees, and zenith angles.
+A field that the instrument cannot provide is Exxx. SUM, if the instrument is set to send it, is the sum of all bytes
+before it modulo 256 as two upper-case hexadecimal digits; a reply with a wrong SUM is refused. Settings are answered by
+a single 06h (done) or 15h (refused). A reply does not contain its units: the instrument must be set to metres, degrees
+and zenith angles.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ CR = b"\r"
 LF = b"\n"
 
 NO_SUM = (
-    "station sends its records without check sums, so that a digit changed on the line passes unseen: switch Checksum "
+    "station sends its records without checksums, so a digit changed on the line would go unnoticed: switch Checksum "
     "on in the instrument's communication settings"
 )
 SUM_AGAIN = "station sends its records with checksums again"
@@ -35,22 +35,22 @@ _REPLY = re.compile(rb"(?:^|(?<=[^0-9A-Za-z ]))" + _FIELD + rb" " + _FIELD + rb"
 
 
 def checksum(data: bytes) -> bytes:
-    """Return the SUM of `data`, separator before it included: two upper-case hexadecimal digits."""
+    """Return the SUM of `data` (including the separator before SUM) as two upper-case hexadecimal digits."""
     return b"%02X" % (sum(data) % 256)
 
 
 def carries_sum(data: bytes) -> bool:
-    """Return True if a sound line, a reply or an identity, ends with its SUM."""
+    """Return True if a valid line (a reply or an identity) ends with a SUM."""
     return data.count(b",") == 4 if data.startswith(b"A ") else data.count(b" ") == 3
 
 
 def encode_command(command: bytes, crlf: bool) -> bytes:
-    """Return the line that carries `command`, ended by CR LF or by CR."""
+    """Return `command` as a line, ended by CR LF or by CR."""
     return command + (CR + LF if crlf else CR)
 
 
 class SetFramer(Framer):
-    """Cuts what a station sends into lines and single ACK or NAK characters. Holds at most 128 bytes."""
+    """Splits a station's bytes into lines and single ACK or NAK characters. Holds at most 128 bytes."""
 
     def feed(self, data: bytes) -> list[Frame | Garbage]:
         found: list[Frame | Garbage] = []
@@ -60,7 +60,7 @@ class SetFramer(Framer):
                 found += self._line()
                 self._start += 1
             elif byte in (ACK, NAK):
-                found += self.flush("cut short by an acknowledgement")
+                found += self.flush("interrupted by an acknowledgement")
                 found.append(Frame(byte, self._start, self._start))
                 self._start += 1
             else:
@@ -70,7 +70,7 @@ class SetFramer(Framer):
         return found
 
     def _line(self) -> list[Frame | Garbage]:
-        """Return the line that ends here, after the clutter before a reply."""
+        """Return the line that ends here, preceded by any garbage before a reply."""
         line, start = bytes(self._buffer), self._start
         if not line:
             return []
@@ -78,7 +78,7 @@ class SetFramer(Framer):
         end = start + len(line) - 1
         reply = _REPLY.search(line)
         at = reply.start() if reply else 0
-        clutter = [Garbage(line[:at], "clutter before a reply", start, start + at - 1)] if at else []
+        clutter = [Garbage(line[:at], "garbage before a reply", start, start + at - 1)] if at else []
         return [*clutter, Frame(line[at:], start + at, end)]
 
 
@@ -92,10 +92,10 @@ def parse_reply(data: bytes, station: str, first_byte: Stamp, last_byte: Stamp) 
         last_byte: when its last byte arrived.
 
     Returns:
-        A fix; NOT_AVAILABLE, with the instrument's codes in `reason`, where a field reads Exxx or the distance is 0.
+        A fix; NOT_AVAILABLE, with the instrument's codes in `reason`, if a field is Exxx or the distance is 0.
 
     Raises:
-        RecordError: the line is no measurement, its SUM is wrong, or an angle is impossible.
+        RecordError: the line is not a measurement, its SUM is wrong, or an angle is impossible.
     """
     if _REPLY.fullmatch(data) is None:
         raise RecordError(f"expected SSSSSSS VVVVVVV HHHHHHH [SUM], found {data.decode('latin-1')!r}")
@@ -124,10 +124,10 @@ def parse_reply(data: bytes, station: str, first_byte: Stamp, last_byte: Stamp) 
 
 
 def parse_identity(data: bytes) -> str:
-    """Return in words the instrument that an `A <name>,<serial>,<ROM>,<EDM>[,SUM]` line names.
+    """Return a description of the instrument from a line `A <name>,<serial>,<ROM>,<EDM>[,SUM]`.
 
     Raises:
-        RecordError: not such a line, or its SUM is wrong.
+        RecordError: the line has a different form, or its SUM is wrong.
     """
     fields = data.decode("latin-1").removeprefix("A ").split(",")
     if not data.startswith(b"A ") or len(fields) not in (4, 5) or not data.isascii() or not all(fields):
@@ -145,8 +145,8 @@ def instrument_codes(fix: Fix) -> tuple[int, ...]:
 class SetParser:
     """Parser of SET lines (`drivers.stations.replies.Parser`).
 
-    A station without SUM is warned about once, when its first line shows it. After lines with SUM a single one without
-    has lost its end on the way and is refused; the next one shows that SUM was switched off.
+    A station without SUM causes one warning, at its first line. After lines with SUM, a single line without SUM is
+    refused, because it lost its end on the way; a second one shows that SUM was switched off.
 
     Args:
         station: name of the station.
@@ -166,7 +166,7 @@ class SetParser:
             return Reply(ReplyKind.ACK, (*self._watch_sum(data, first_byte), identity))
         fix = parse_reply(data, self._station, first_byte, last_byte)
         codes = frozenset(instrument_codes(fix))
-        # It is not known if lines with error codes carry a SUM as well; they hold no digits that could be changed
+        # It is unknown whether lines with error codes have a SUM; they contain no measured digits that could be altered
         warnings = [] if codes else self._watch_sum(data, first_byte)
         new, self._codes = codes - self._codes, codes
         errors = [
@@ -175,7 +175,7 @@ class SetParser:
         return Reply(ReplyKind.RECORD, (*warnings, *errors, fix))
 
     def _watch_sum(self, data: bytes, first_byte: Stamp) -> list[DeviceEvent]:
-        """Return a warning at the first sound line without SUM, and its end at the first with SUM again."""
+        """Return a warning at the first valid line without SUM, and its end at the first line with SUM again."""
         had_sum, self._has_sum = self._has_sum, carries_sum(data)
         if self._has_sum and self._is_warned:
             self._is_warned = False
@@ -184,7 +184,7 @@ class SetParser:
             return []
         if had_sum:
             self._has_sum = None
-            raise RecordError("the line ends before its SUM, which the lines before it carry")
+            raise RecordError("the line has no SUM, but the previous lines had one")
         self._is_warned = True
         return [DeviceEvent(self._station, first_byte, EventKind.WARNING, NO_SUM, _SUM_CODE)]
 

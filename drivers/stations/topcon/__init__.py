@@ -1,1 +1,1 @@
-"""Topcon total stations: the "GTS" serial protocol of the classic series and of the GTS-8 tracking family."""
+"""The "GTS" serial protocol of Topcon total stations: the classic series and the GTS-8 tracking family."""

@@ -18,7 +18,7 @@ class GtsParser:
 
     Args:
         station: name of the station.
-        options: units of the corrections in its records.
+        options: options of the station, with the units of the corrections in its records.
     """
 
     def __init__(self, station: str, options: ProfileOptions) -> None:
@@ -27,7 +27,7 @@ class GtsParser:
         self._in_error = False
 
     def parse(self, data: bytes, first_byte: Stamp, last_byte: Stamp) -> Reply:
-        if data.startswith(b"E"):  # seen by name only: which code means what is not known
+        if data.startswith(b"E"):  # the meaning of the error codes is unknown
             error = instrument_error(self._station, first_byte, f"station reports error {data.decode('ascii')!r}")
             return Reply(ReplyKind.UNUSABLE, (error,))
         fix = parse_record(data, self._station, first_byte, last_byte, self._scales)

@@ -2,10 +2,10 @@
 
     frame = DATA + BCC + ETX [+ CR LF]      BCC = XOR of every byte of DATA, as exactly three decimal digits
 
-There is no start character, so a framer finds its feet at ETX, at the known header characters, and by the BCC. Line
-faults that instruments and adapters are known to produce are tolerated: an acknowledgement joined to the record
-that follows it, its 06h lost or followed by a space, a lost ETX, CR LF or none, clutter before a record. What is
-left is handed on as garbage with its bytes, never guessed at.
+There is no start character, so a framer synchronizes on ETX, the known header characters and the BCC. It tolerates line
+faults that instruments and adapters are known to produce: an acknowledgement joined to the record that follows it, its
+06h lost or followed by a space, a lost ETX, CR LF or no line end, garbage before a record. Remaining bytes are returned
+as garbage, and their meaning is never guessed.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ LONGEST_FRAME = 128  # the longest record has 59 characters before ETX
 _BUFFER_LIMIT = 2 * LONGEST_FRAME
 
 _FRAME = re.compile(rb"(?P<data>[\x06\x15]|[ -~]+)(?P<bcc>\d{3})", re.DOTALL)
-_ACK_TAIL = re.compile(rb"\x06 ?006\Z")  # some stations put a space after 06h
-_BARE_ACK = re.compile(rb" ?006\Z")  # 06h lost
+_ACK_TAIL = re.compile(rb"\x06 ?006\Z")  # some stations send a space after 06h
+_BARE_ACK = re.compile(rb" ?006\Z")  # 06h was lost
 
 
 def block_check(data: bytes) -> bytes:
@@ -36,23 +36,23 @@ def block_check(data: bytes) -> bytes:
 
 
 def encode_frame(data: bytes, crlf: bool) -> bytes:
-    """Return the frame that carries `data`.
+    """Return `data` as a frame.
 
     Args:
         data: command or record, ASCII.
-        crlf: end with CR LF after ETX.
+        crlf: add CR LF after ETX.
     """
     return data + block_check(data) + ETX + (CRLF if crlf else b"")
 
 
 def decode_frame(segment: bytes) -> bytes | None:
-    """Return the data of `segment` (the bytes before ETX); None unless it is a frame with the right BCC."""
+    """Return the data of `segment` (the bytes before ETX); None unless it is a frame with a correct BCC."""
     match = _FRAME.fullmatch(segment)
     return match["data"] if match is not None and block_check(match["data"]) == match["bcc"] else None
 
 
 class GtsFramer(Framer):
-    """Cuts what a station sends into frames. Holds at most 256 bytes."""
+    """Splits a station's bytes into frames. Holds at most 256 bytes."""
 
     def feed(self, data: bytes) -> list[Frame | Garbage]:
         found: list[Frame | Garbage] = []
@@ -70,14 +70,14 @@ class GtsFramer(Framer):
 
 
 def _resolve(segment: bytes, start: int) -> list[Frame | Garbage]:
-    """Return the frames and garbage of a segment that ends with ETX, found from its end backwards."""
+    """Return the frames and garbage of a segment that ends with ETX, searched from its end backwards."""
     found: list[Frame | Garbage] = []
     end = start + len(segment) - 1
     rest = segment[:-1]
     while split := _last_frame(rest):
         at, data = split
         found.append(Frame(data, start + at, end))
-        # What stood before had its own ETX lost, or is clutter.
+        # Bytes before the frame are a frame that lost its ETX, or garbage
         rest = rest[:at].rstrip(CRLF)
         end = start + len(rest) - 1
     if rest:
@@ -88,13 +88,13 @@ def _resolve(segment: bytes, start: int) -> list[Frame | Garbage]:
 
 
 def _last_frame(rest: bytes) -> tuple[int, bytes] | None:
-    """Return the place in `rest` of the frame that ends it, and its data; None if none does."""
+    """Return the start and the data of the frame at the end of `rest`; None if there is none."""
     if _BARE_ACK.fullmatch(rest):
         return 0, ACK
     acknowledged = _ACK_TAIL.search(rest)
     if acknowledged is not None:
         return acknowledged.start(), ACK
-    # Records first: an XOR of seven bits lets one in 128 pieces of clutter pass as the beginning of a frame.
+    # Records first, because an XOR of seven bits accepts one in 128 pieces of garbage as the beginning of a frame
     for at in [*(at for at, byte in enumerate(rest) if byte in RECORD_HEADERS), 0]:
         data = decode_frame(rest[at:])
         if data is not None:
@@ -105,5 +105,5 @@ def _last_frame(rest: bytes) -> tuple[int, bytes] | None:
 def _why_no_frame(rest: bytes) -> str:
     match = _FRAME.fullmatch(rest)
     if match is None:
-        return "no frame: expected printable data and three digits of BCC before ETX"
+        return "not a frame: expected printable data and three digits of BCC before ETX"
     return f"BCC is {match['bcc'].decode()}, computed {block_check(match['data']).decode()}"

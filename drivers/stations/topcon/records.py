@@ -1,7 +1,7 @@
-"""Records of the Topcon GTS protocol, which frames carry as their data. Layouts: `?` `(` `<` `U` `/` `Q`.
+"""Records of the Topcon GTS protocol, which are the data of frames. Layouts: `?` `(` `<` `U` `/` `Q`.
 
-Zenith angles are counted from the zenith (0 = up), as the instruments are set for this work. A record whose every
-character does not fit its layout is refused whole.
+Vertical angles are counted from the zenith (0 = up); the instruments must be set accordingly. A record with any
+character that does not fit its layout is refused as a whole.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ _SLOPE_TENTH_MM = (
     r"(?P<sd>[+-]\d{9})(?P<unit>[mfi])(?P<v>\d{8})(?P<h>[+-]\d{8})(?P<angle>[dg])(?P<hd>[+-]\d{9})"
     r"(?P<tilt>[t?*])(?P<level>\d\d|\*\*)(?P<ppm>[+-]\d{4})(?P<prism>[+-]\d{3})"
 )
-_SLOPE_FINE = re.compile(r"\(" + _SLOPE_TENTH_MM + r"[!-~]{2}")  # two characters of unknown meaning, `**` as seen
+_SLOPE_FINE = re.compile(r"\(" + _SLOPE_TENTH_MM + r"[!-~]{2}")  # two characters of unknown meaning, observed as `**`
 _TRACKING = re.compile(r"Q" + _SLOPE_TENTH_MM + r"(?P<battery>\d)(?P<edm>\d)(?P<flag>\d)(?P<face>[rl])")
 _ANGLES = re.compile(r"<(?P<v>\d{7})(?P<h>[+-]\d{7})(?P<tilt>[+-]\d{4})(?P<angle>[dg])")
-# Coordinates have ten digits each, or eight each; beside those of eight, ten where eight do not hold the number.
+# Coordinates have ten digits each, or eight each; in the latter form a number too large for eight digits has ten.
 _LONG, _SHORT = r"[+-]\d{10}", r"[+-](?:\d{8}|(?!00)\d{10})"
 _COORDINATES = re.compile(
     rf"(?P<header>[U/])(?={_LONG}{_LONG}{_LONG}[mfi]|{_SHORT}{_SHORT}{_SHORT}[mfi])"
@@ -53,11 +53,11 @@ _TRACKING_FLAG = {
 
 @dataclass(frozen=True, slots=True)
 class CorrectionScales:
-    """Units of the corrections that `(` and `Q` records carry; no source states them.
+    """Units of the corrections in `(` and `Q` records; no source documents them.
 
-    The defaults fit the instruments' settings exactly: -999.9..+999.9 ppm fill sign and four digits, and
-    -99.9..+99.9 mm fill sign and three. `?` records have two digits each, of 1 ppm and 1 mm. The corrections are
-    kept for the record; displayed distances already contain them.
+    The defaults fit the instruments' ranges exactly: -999.9 to +999.9 ppm need a sign and four digits, and -99.9 to
+    +99.9 mm a sign and three digits. `?` records have two digits each, of 1 ppm and 1 mm. The corrections are only
+    recorded; displayed distances already contain them.
 
     Attributes:
         ppm: ppm per count of the atmospheric correction.
@@ -74,18 +74,18 @@ def parse_record(
     """Parse a record.
 
     Args:
-        data: data of a frame whose BCC was right.
+        data: data of a frame with a correct BCC.
         station: name of the station.
         first_byte: when the record's first byte arrived.
         last_byte: when its last byte arrived.
         scales: units of the corrections in `(` and `Q` records.
 
     Returns:
-        A fix; status NOT_AVAILABLE where the station gives no distance or is not locked, OUT_OF_RANGE where its
-        compensator is.
+        A fix; its status is NOT_AVAILABLE if there is no distance or the station is not locked, and OUT_OF_RANGE if the
+        compensator is out of range.
 
     Raises:
-        RecordError: the data do not follow the layout of their header, or contradict themselves.
+        RecordError: the data does not follow the layout for its header, or is inconsistent.
     """
     text = data.decode("latin-1")
     make = partial(Fix, station=station, stamp=first_byte, last_byte=last_byte, raw=data)
@@ -116,9 +116,9 @@ def _hz_angle_rad(match: re.Match[str]) -> float:
 
 def _metres(digits: str, unit: str, counts_per_unit: int) -> float:
     if unit == "i":
-        # The one program known to convert it divides the digits after the point by 1.16, which cannot be right for
-        # twelve inches to a foot.
-        raise RecordError("distance is in feet and inches, whose coding is not known; set the instrument to metres")
+        # The only program known to convert this divides the decimals by 1.16, which cannot be right with twelve inches
+        # to a foot
+        raise RecordError("distance is in feet and inches, whose coding is unknown; set the instrument to metres")
     return int(digits) / counts_per_unit * (METRES_PER_FOOT if unit == "f" else 1.0)
 
 
@@ -151,9 +151,9 @@ def _slope(make: Callable[..., Fix], match: re.Match[str], counts_per_unit: int,
 
 
 def _tracking(make: Callable[..., Fix], match: re.Match[str], scales: CorrectionScales) -> Fix:
-    """Parse `Q`: usable if the tracking flag says locked, there is a distance, and the compensator is on and in range.
+    """Parse `Q`: usable if the tracking flag is "locked", there is a distance, and the compensator is on and in range.
 
-    The face is taken from the zenith angle, which the position is computed from, and not from the `r`/`l` flag.
+    The face is derived from the zenith angle, from which the position is computed, and not from the `r`/`l` flag.
     """
     fix = _slope(make, match, 10_000, scales)
     lock, why_not = _TRACKING_FLAG.get(int(match["flag"]), (LockState.UNKNOWN, "unknown tracking flag"))
@@ -174,7 +174,7 @@ def _angles(make: Callable[..., Fix], match: re.Match[str]) -> Fix:
         hz_angle_rad=_hz_angle_rad(match),
         zenith_angle_rad=zenith,
         face=face_of(zenith),
-        reason="an angle record: no distance",
+        reason="the record has only angles, no distance",
     )
 
 

@@ -25,20 +25,20 @@ class Frame(NamedTuple):
 
 
 class BusDevice(Protocol):
-    """A device that sends frames of itself. Times are simulated seconds."""
+    """A device that sends frames without being asked. Times are simulated seconds."""
 
     def poll(self, now_s: float) -> list[Frame]:
         """Return the frames that are due."""
 
     def next_deadline(self) -> float:
-        """Instant at which the next frames are due."""
+        """Return the instant at which the next frames are due."""
 
 
 class BusController:
-    """Starts every node that reports its boot-up, again after a reboot; sends SYNC.
+    """Starts every node that reports a boot-up, also after a reboot, and sends SYNC.
 
     Args:
-        sync_period_s: SYNC interval; None sends none.
+        sync_period_s: SYNC interval; None for no SYNC.
     """
 
     def __init__(self, sync_period_s: float | None) -> None:
@@ -47,7 +47,7 @@ class BusController:
         self._starts: list[tuple[float, int]] = []
 
     def receive(self, frame: Frame, now_s: float) -> None:
-        """Hear a frame on the bus."""
+        """Process a frame on the bus."""
         if frame.arbitration_id & ~0x7F == 0x700 and frame.data == b"\x00":
             self._starts.append((now_s + _START_DELAY_S, frame.arbitration_id & 0x7F))
 
@@ -62,5 +62,5 @@ class BusController:
         return frames
 
     def next_deadline(self) -> float:
-        """Instant at which `poll` is due."""
+        """Return the instant at which `poll` is due."""
         return min([self._next_sync_s, *(at_s for at_s, _ in self._starts)])

@@ -1,7 +1,7 @@
 """The machine controller's own frames: valve currents (200h) and pressures with oil temperature (201h).
 
 The layout is that of `calibration/rigs/machine.dbc`, packed here by hand: little endian; currents in mA as signed
-16 bit; pressures in 0.1 bar as unsigned 16 bit, temperature in degC + 40 as 8 bit, a message counter of 4 bit.
+16 bit; pressures in 0.1 bar as unsigned 16 bit, temperature in degC + 40 as 8 bit, and a message counter of 4 bit.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ VALVES = ("boom", "arm", "feed", "slew")  # in the order of the frame
 
 @dataclass(frozen=True)
 class MachineState:
-    """Speeds and load that the controller's signals depend on.
+    """Speeds and load on which the controller's signals depend.
 
     Attributes:
-        speeds: valve name -> speed of its joint as a share of the maximum, signed.
-        boom_load_bar: pressure that the load puts on the boom cylinder's lower side.
+        speeds: valve name -> signed speed of its joint as a share of the maximum.
+        boom_load_bar: pressure in the boom cylinder's lower side due to the load.
     """
 
     speeds: Mapping[str, float]
@@ -46,9 +46,9 @@ class MachineSignals:
     """The machine controller as a sender of frames.
 
     Args:
-        state: what moves, at an instant in simulated seconds.
-        rng: noise of currents and pressures.
-        period_s: each frame's cycle.
+        state: function that returns the machine's state at an instant in simulated seconds.
+        rng: random generator for the noise of currents and pressures.
+        period_s: cycle time of each frame.
     """
 
     def __init__(
@@ -66,15 +66,15 @@ class MachineSignals:
         self._void_until = -math.inf
 
     def skip_frames(self, count: int) -> None:
-        """Lose frames: the message counter jumps by `count`."""
+        """Simulate lost frames: the message counter jumps by `count`."""
         self._counter = (self._counter + count) % 16
 
     def void(self, until_s: float) -> None:
-        """Send `not available` (all ones) for pressures and temperature until then."""
+        """Send `not available` (all ones) for pressures and temperature until `until_s`."""
         self._void_until = until_s
 
     def next_deadline(self) -> float:
-        """Instant at which the next frames are due."""
+        """Return the instant at which the next frames are due."""
         return self._next_s
 
     def poll(self, now_s: float) -> list[Frame]:

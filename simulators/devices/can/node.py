@@ -1,6 +1,6 @@
-"""A CANopen slave without its profile (CiA 301): NMT, boot-up, heartbeat, SDO, TPDOs, EMCY, stored parameters.
+"""A CANopen slave without a device profile (CiA 301): NMT, boot-up, heartbeat, SDO, TPDOs, EMCY, stored parameters.
 
-Sans-IO: frames and the time go in, frames come out. Times are simulated seconds.
+It does no I/O: it takes frames and the time, and returns frames. Times are simulated seconds.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ BOOT_S = 0.25  # from power-on or reset to the boot-up message
 
 
 class NmtState(IntEnum):
-    """NMT state, as in the byte of a heartbeat."""
+    """NMT states with their values in a heartbeat."""
 
     BOOT_UP = 0x00
     STOPPED = 0x04
@@ -33,16 +33,16 @@ class CanopenNode:
     """A node on a bus, without power until `power_on`.
 
     Attributes:
-        node: its node number.
+        node: node number.
         state: NMT state.
-        dictionary: its objects.
+        dictionary: object dictionary.
 
     Args:
         node: node number, 1 to 127.
         device_type: object 1000h.
         name: object 1008h.
         identity: vendor, product, revision and serial number (1018h).
-        mappings: for each TPDO the words mapped by the factory.
+        mappings: factory mapping words of each TPDO.
     """
 
     def __init__(
@@ -87,18 +87,18 @@ class CanopenNode:
         add(0x1017, 0, Entry(Kind.U16, access="rw", saved=True, write=self._set_heartbeat))
         self.dictionary.record(0x1018, *(Entry(Kind.U32, value) for value in identity))
 
-    # What a device does of itself
+    # Actions of the device itself
 
     def power_on(self, now_s: float) -> None:
         """Boot with the stored parameters."""
         self._reset(now_s, communication_only=False)
 
     def mute(self, until_s: float) -> None:
-        """Send and hear nothing until then: a broken cable."""
+        """Send and receive nothing until `until_s`, as with a broken cable."""
         self._muted_until = until_s
 
     def emergency(self, code: int, register: int, manufacturer: bytes = bytes(5)) -> None:
-        """Report an error: EMCY, error register and history. Code 0 reports that all errors are gone."""
+        """Report an error: EMCY, error register and history. Code 0 reports that all errors have cleared."""
         self._error_register = register if code else 0
         if code:
             self._errors.insert(0, code)
@@ -110,14 +110,14 @@ class CanopenNode:
     def commission(
         self, *, sync: bool, pdo: int, period_ms: int, heartbeat_ms: int, mapping: Sequence[int] = ()
     ) -> None:
-        """Set and store the parameters of a first start: one TPDO on SYNC or on its timer, the others off.
+        """Set and store parameters as at commissioning: one TPDO on SYNC or on its event timer, the others off.
 
         Args:
-            sync: send the TPDO on SYNC, else on its timer.
+            sync: send the TPDO on SYNC, else on its event timer.
             pdo: number of the TPDO that is on.
-            period_ms: its timer.
-            heartbeat_ms: producer time.
-            mapping: content of that TPDO, as words of object 1A00h; the factory's mapping if there are none.
+            period_ms: period of its event timer.
+            heartbeat_ms: heartbeat producer time.
+            mapping: mapping of that TPDO, as words of object 1A00h; empty for the factory mapping.
         """
         for tpdo in self.tpdos:
             index, wanted = 0x1800 + tpdo.number - 1, tpdo.number == pdo
@@ -134,7 +134,7 @@ class CanopenNode:
     # The bus
 
     def receive(self, frame: Frame, now_s: float) -> list[Frame]:
-        """Hear a frame; returns the frames that the node sends in answer."""
+        """Process a frame; return the frames that the node sends in answer."""
         if now_s < self._muted_until:
             return []
         self._now = now_s
@@ -181,7 +181,7 @@ class CanopenNode:
         return [] if muted else frames
 
     def next_deadline(self) -> float:
-        """Instant at which `poll` is due."""
+        """Return the instant at which `poll` is due."""
         if self.state is NmtState.BOOT_UP:
             return self._boot_at
         timers = [t.due_s for t in self.tpdos] if self.state is NmtState.OPERATIONAL else []
@@ -209,7 +209,7 @@ class CanopenNode:
     def _reset(self, now_s: float, *, communication_only: bool) -> None:
         self.state = NmtState.BOOT_UP
         self._now = now_s
-        self._boot_at = now_s + BOOT_S + self.node * 1e-3  # no two start at the same instant
+        self._boot_at = now_s + BOOT_S + self.node * 1e-3  # so that no two nodes start at the same instant
         self._heartbeat_at = math.inf
         self._sdo.reset()
         self._out.clear()
@@ -223,18 +223,18 @@ class CanopenNode:
                 tpdo.follow_node(old, self.node)
 
     def after_reset(self) -> None:
-        """Take over restored parameters; a hook for profiles."""
+        """Apply restored parameters; a hook for profiles."""
 
     def save(self) -> None:
         """Store the parameters."""
         self._stored = self.dictionary.stored()
 
     def reset(self) -> None:
-        """Reset as NMT command 81h does."""
+        """Reset like NMT command 81h."""
         self._reset(self._now, communication_only=False)
 
     def reset_after_answer(self) -> None:
-        """Reset once the answer to the SDO request that asked for it is out."""
+        """Reset after the answer to the SDO request that caused the reset is sent."""
         self._reset_pending = True
 
     def _save(self, value: Value) -> None:
@@ -245,7 +245,7 @@ class CanopenNode:
     def _load(self, value: Value) -> None:
         if value != LOAD:
             raise AbortError(Abort.STORE)
-        self._stored = {}  # the factory's values count from the next reset on
+        self._stored = {}  # factory values apply from the next reset on
 
     def _clear_history(self, value: Value) -> None:
         if value != 0:

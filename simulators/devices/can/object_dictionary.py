@@ -31,7 +31,7 @@ class Abort(IntEnum):
 
 
 class AbortError(Exception):
-    """An access that the device refuses."""
+    """The device refuses an access."""
 
     def __init__(self, code: Abort) -> None:
         super().__init__(f"{code.name} {code:08X}h")
@@ -68,11 +68,11 @@ class Entry:
 
     Attributes:
         kind: data type.
-        value: its content, unless `read` computes it.
-        access: `ro`, `rw`, `wo`.
-        mappable: may be mapped into a TPDO.
-        saved: survives a reset once stored.
-        read: computes the value at the time of asking.
+        value: current value, unless `read` computes it.
+        access: `ro`, `rw` or `wo`.
+        mappable: the entry may be mapped into a TPDO.
+        saved: the value survives a reset once stored.
+        read: function that computes the value at each access.
         write: called with the new value instead of storing it; may raise AbortError.
     """
 
@@ -86,15 +86,15 @@ class Entry:
 
     @property
     def size(self) -> int | None:
-        """Bytes of the value; None for strings."""
+        """Size of the value in bytes; None for strings."""
         return None if self.kind is Kind.STRING else struct.calcsize(_FORMATS[self.kind])
 
     def current(self) -> Value:
-        """Current value."""
+        """Return the current value."""
         return self.value if self.read is None else self.read()
 
     def encode(self) -> bytes:
-        """Current value as bytes, little endian."""
+        """Return the current value as bytes, little endian."""
         value = self.current()
         if self.kind is Kind.STRING:
             return str(value).encode("ascii")
@@ -115,7 +115,7 @@ class ObjectDictionary:
         self._factory: dict[tuple[int, int], Value] = {}
 
     def add(self, index: int, sub: int, entry: Entry) -> Entry:
-        """Put an entry in place; its value now is the factory's."""
+        """Add or replace an entry; its current value becomes the factory value."""
         self._entries[index, sub] = entry
         self._indices.add(index)
         self._factory[index, sub] = entry.value
@@ -135,11 +135,11 @@ class ObjectDictionary:
         return entry
 
     def value(self, index: int, sub: int = 0) -> int:
-        """Value of an integer entry."""
+        """Return the value of an integer entry."""
         return int(self.entry(index, sub).current())
 
     def put(self, index: int, sub: int, value: Value) -> None:
-        """Set a value as the device itself does, past access rights."""
+        """Set a value as the device itself, regardless of access rights."""
         self.entry(index, sub).value = value
 
     def read(self, index: int, sub: int) -> bytes:
@@ -153,13 +153,14 @@ class ObjectDictionary:
         """Carry out an expedited SDO download.
 
         Args:
-            index: of the object.
-            sub: its sub-index.
-            data: the size that was given, or all four bytes if none was (command 22h: devices take what they need).
+            index: index of the object.
+            sub: sub-index.
+            data: bytes of the given size, or all four bytes if no size was given (command 22h: devices use as many as
+                they need).
             size_given: the command states the number of bytes.
 
         Raises:
-            AbortError: refused.
+            AbortError: the access is refused.
         """
         entry = self.entry(index, sub)
         if entry.access == "ro":
@@ -182,7 +183,7 @@ class ObjectDictionary:
         return {key: e.value for key, e in self._saved()}
 
     def restore(self, values: dict[tuple[int, int], Value], *, communication_only: bool = False) -> None:
-        """Load stored values as a reset does, and the factory's for values that were never stored."""
+        """Load stored values like a reset, and factory values for entries that were never stored."""
         for key, entry in self._saved():
             if communication_only and not 0x1000 <= key[0] < 0x2000:
                 continue

@@ -1,7 +1,8 @@
 """The devices on the boom's bus: CiA 406 encoders and linear transducers, CiA 404 pressure transmitters.
 
-Objects and defaults follow the manuals of POSITAL-type encoders (node 32, factory-silent TPDO1, 3000h node number less
-one, 2300h save with reset), in-cylinder transducers (6020h) and pressure transmitters (6130h, 7130h, 9130h).
+Objects and defaults follow the manuals of POSITAL-type encoders (node 32, TPDO1 silent by default, node number minus
+one in 3000h, save with reset by 2300h), in-cylinder transducers (6020h) and pressure transmitters (6130h, 7130h,
+9130h).
 """
 
 from __future__ import annotations
@@ -29,9 +30,9 @@ class PositionNode(CanopenNode):
 
     Args:
         node: node number.
-        source: the measured quantity.
+        source: measured quantity.
         device_type, name, serial: identity.
-        mapping: words of both TPDOs.
+        mapping: mapping words of both TPDOs.
     """
 
     def __init__(
@@ -44,7 +45,7 @@ class PositionNode(CanopenNode):
         super().__init__(node, device_type=device_type, name=name, identity=identity, mappings=(mapping, mapping))
         add = self.dictionary.add
         add(0x2300, 0, Entry(Kind.U32, access="wo", write=self._save_with_reset))
-        number = self._within(0x3000, 0, 126)  # takes effect once stored and reset
+        number = self._within(0x3000, 0, 126)  # takes effect after storing and a reset
         add(0x3000, 0, Entry(Kind.U8, node - 1, access="rw", saved=True, write=number))
         add(0x3001, 0, Entry(Kind.U8, 0, access="rw", saved=True, write=self._within(0x3001, 0, 7, Abort.VALUE_HIGH)))
         add(0x6000, 0, Entry(Kind.U16, 0, access="rw", saved=True))
@@ -61,7 +62,7 @@ class PositionNode(CanopenNode):
         add(0x650B, 0, Entry(Kind.U32, serial))
 
     def set_alarm(self, bits: int) -> None:
-        """Set the alarms (6503h); a new one is reported by EMCY, the end of all of them too."""
+        """Set the alarms (6503h); EMCY reports a new alarm, and the end of all alarms."""
         before = self.dictionary.value(0x6503)
         self.dictionary.put(0x6503, 0, bits)
         if bits & ~before:
@@ -74,7 +75,7 @@ class PositionNode(CanopenNode):
         self.dictionary.put(0x6505, 0, bits)
 
     def jump(self, counts: int) -> None:
-        """Shift the position, as someone's preset does."""
+        """Shift the position by `counts`, like a preset written by someone."""
         self._preset_offset += counts
 
     def _timer_alias(self) -> Entry:
@@ -82,7 +83,7 @@ class PositionNode(CanopenNode):
         return Entry(Kind.U16, access="rw", read=lambda: tpdo.timer_ms, write=tpdo.write_timer)
 
     def _within(self, index: int, low: int, high: int, abort: Abort = Abort.VALUE) -> Callable[[Value], None]:
-        """Return what writes an object's value if it is within these bounds."""
+        """Return a function that writes an object's value if it is within these bounds, and else aborts."""
 
         def write(value: Value) -> None:
             if not low <= int(value) <= high:
@@ -111,9 +112,9 @@ class EncoderNode(PositionNode):
 
     Args:
         node: node number.
-        turns: the measured shaft angle in turns and turns per second.
+        turns: measured shaft angle in turns, and turns per second.
         steps_per_turn: physical resolution (6501h).
-        revolutions: turns that it can tell apart (6502h).
+        revolutions: number of distinguishable turns (6502h).
         units_per_revolution, total_units: 6001h and 6002h.
         serial: serial number.
     """
@@ -180,10 +181,10 @@ class LinearNode(PositionNode):
 
     Args:
         node: node number.
-        length: the measured length: mm and mm/s.
+        length: measured length in mm, and mm/s.
         step_nm: measuring step.
         offset_counts: position at length zero.
-        sign: -1 when it counts down as the length grows.
+        sign: -1 if the counts fall as the length grows.
         mapped: object in both TPDOs, `6020` or `6004`.
         serial: serial number.
     """
@@ -229,9 +230,9 @@ class PressureNode(CanopenNode):
 
     Args:
         node: node number.
-        pressure: the measured pressure: bar (and a rate that is not used).
+        pressure: measured pressure in bar (and a rate that is not used).
         mapped: object in both TPDOs: `6130` (REAL32), `7130` (I16) or `9130` (I32).
-        decimal_digits: 6132h.1, of the integer forms.
+        decimal_digits: 6132h.1, for the integer objects.
         serial: serial number.
     """
 
@@ -261,7 +262,7 @@ class PressureNode(CanopenNode):
 
 
 def encoder_of(channel: Cia406Encoder, degrees: Source, serial: int) -> EncoderNode:
-    """Build the encoder of a rig's channel, mounted so that the channel reads `degrees`."""
+    """Build the encoder for a rig's channel, mounted so that the channel's value is `degrees`."""
     units, total = channel.units_per_revolution, channel.total_units
     steps = max(units, 65536)
 
@@ -281,7 +282,7 @@ def encoder_of(channel: Cia406Encoder, degrees: Source, serial: int) -> EncoderN
 
 
 def linear_of(channel: Cia406Linear, length: Source, serial: int) -> LinearNode:
-    """Build the transducer of a rig's channel."""
+    """Build the transducer for a rig's channel."""
     return LinearNode(
         channel.node,
         length,
@@ -294,7 +295,7 @@ def linear_of(channel: Cia406Linear, length: Source, serial: int) -> LinearNode:
 
 
 def pressure_of(channel: Cia404Analogue, value: Source, serial: int) -> PressureNode:
-    """Build the transmitter of a rig's channel; its own unit is before the channel's scale and offset."""
+    """Build the transmitter for a rig's channel; it sends the value before the channel's scale and offset."""
 
     def own_unit(now_s: float) -> tuple[float, float]:
         shown, rate = value(now_s)

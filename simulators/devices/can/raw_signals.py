@@ -1,4 +1,4 @@
-"""Values at a fixed place of a CAN frame, for machines that are described signal by signal."""
+"""Values at a fixed position in a CAN frame, for machines that are described signal by signal."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from simulators.devices.can.bus import Frame
 
 
 def pack(channel: RawSignal, value: float) -> bytes:
-    """Eight bytes with the value at the channel's place and zeros elsewhere; clipped to the place's range."""
+    """Return eight bytes with the value, clipped to the field's range, in the channel's field and zeros elsewhere."""
     counts = round((value - channel.offset) / channel.scale)
     low, high = (-(1 << channel.length_bits - 1), (1 << channel.length_bits - 1) - 1)
     if not channel.is_signed:
@@ -17,7 +17,7 @@ def pack(channel: RawSignal, value: float) -> bytes:
     counts = max(low, min(high, counts)) & ((1 << channel.length_bits) - 1)
     if channel.byte_order == "intel":
         return (counts << channel.start_bit & (1 << 64) - 1).to_bytes(8, "little")
-    # Motorola: the start bit is the most significant one; bit 7 of byte 0 is the first on the wire.
+    # Motorola: the start bit is the most significant one; bit 7 of byte 0 is the first on the wire
     first = channel.start_bit // 8 * 8 + 7 - channel.start_bit % 8
     return (counts << 64 - first - channel.length_bits & (1 << 64) - 1).to_bytes(8, "big")
 
@@ -26,11 +26,11 @@ _PERIOD_S = 0.02
 
 
 class RawSignals:
-    """Sends every frame that the channels name, each at the same period.
+    """Sends the frames of all channels, each at the same period.
 
     Args:
-        channels: the signals; those of one frame share it.
-        sources: channel name -> its value and rate at an instant in simulated seconds.
+        channels: the signals; signals with the same identifier share one frame.
+        sources: channel name -> function that returns value and rate at an instant in simulated seconds.
     """
 
     def __init__(
@@ -57,5 +57,5 @@ class RawSignals:
         return frames
 
     def next_deadline(self) -> float:
-        """Instant at which the next frames are due."""
+        """Return the instant at which the next frames are due."""
         return self._next_s

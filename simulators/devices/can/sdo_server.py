@@ -27,7 +27,7 @@ class SdoServer:
         self._upload: _Upload | None = None
 
     def reset(self) -> None:
-        """Forget a transfer that was under way."""
+        """Discard an unfinished transfer."""
         self._upload = None
 
     def respond(self, request: bytes) -> bytes | None:

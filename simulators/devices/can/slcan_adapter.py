@@ -1,9 +1,10 @@
-"""A Lawicel (slcan) adapter: the serial end of a CAN bus, as python-can's `slcan` interface and slcand use it.
+"""A Lawicel (slcan) adapter: the serial end of a CAN bus, for python-can's `slcan` interface and slcand.
 
-Commands end with CR; CR answers "done", BEL answers "refused". O opens, L opens listen-only (nothing may be sent),
-C closes, Sn sets the bit rate, sxxyy the bit timing registers, t/T/r/R send, F reads the status, V and N identify.
-Unasked it tells of errors on the bus: sbRRRTTT of the controller's state (active, warning, passive, bus-off) with its
-counters, eNccc of N errors. Sans-IO. (CAN232 manual, Lawicel AB; error lines: Linux, drivers/net/can/slcan)
+Commands end with CR. The answer CR means "done", BEL means "refused". O opens the channel, L opens it listen-only
+(nothing may be sent), C closes it, Sn sets the bit rate, sxxyy the bit timing registers, t/T/r/R send, F reads the
+status, V and N identify. The adapter reports errors on the bus without being asked: sxRRRTTT for the controller's state
+x (active, warning, passive, bus-off) with its counters, eNccc for N errors. It does no I/O. (CAN232 manual, Lawicel AB;
+error lines: Linux, drivers/net/can/slcan)
 """
 
 from __future__ import annotations
@@ -38,11 +39,12 @@ class SlcanAdapter:
     """State of the adapter.
 
     Attributes:
-        channel: whether it is open, and for what.
-        refused: number of frames that it refused to send.
+        channel: state of the channel.
+        refused: number of frames that the adapter refused to send.
 
     Args:
-        bit_rate: of the bus it is plugged into; set to another rate it hears nothing. None: any rate fits.
+        bit_rate: bit rate of the bus; if the adapter is set to a different rate, it receives nothing. None accepts any
+            rate.
     """
 
     def __init__(self, bit_rate: int | None = None) -> None:
@@ -53,7 +55,7 @@ class SlcanAdapter:
         self._buffer = bytearray()
 
     def feed(self, data: bytes) -> tuple[bytes, list[Frame]]:
-        """Take bytes from the host.
+        """Process bytes from the host.
 
         Returns:
             The adapter's answers, and the frames to put on the bus.
@@ -75,7 +77,7 @@ class SlcanAdapter:
         return answers, frames
 
     def encode(self, frame: Frame) -> bytes:
-        """Encode a frame on the bus for the host; nothing while the channel is closed or set to another bit rate."""
+        """Encode a frame on the bus for the host; empty if the channel is closed or the bit rate is wrong."""
         if self.channel is Channel.CLOSED or self._bit_rate != self._bus_bit_rate:
             return b""
         if frame.is_error:
@@ -111,7 +113,7 @@ class SlcanAdapter:
             return OK
         if letter == "s" and len(rest) == 4 and closed:
             return OK
-        # Z0: no timestamps, which is all that this adapter offers. An empty command is a host clearing its line.
+        # Z0: no timestamps, the only mode of this adapter. Hosts send an empty command to clear their line.
         answers = {"V": b"V1013" + OK, "N": b"NSIM1" + OK, "F": b"F00" + OK, "Z0": OK, "": OK}
         return answers.get(letter + rest, REFUSED)
 

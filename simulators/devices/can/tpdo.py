@@ -1,4 +1,4 @@
-"""A transmit PDO of a simulated node (CiA 301, 7.2.2): transmission types, timers, mapping, what may change when."""
+"""A transmit PDO of a simulated node (CiA 301, 7.2.2): transmission types, timers, mapping, and rules for changes."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ _MAP_LIMIT = 4  # objects a PDO of these devices can hold
 
 
 class Tpdo:
-    """One TPDO: communication parameters at 1800h, mapping at 1A00h (plus its number less one).
+    """One TPDO: communication parameters at 1800h, mapping at 1A00h (plus the TPDO's number minus one).
 
-    As devices do, it refuses (08000022h) a new COB-ID, transmission type, inhibit time or mapping while it is valid;
-    its event timer may change at any time.
+    Like real devices, it refuses (08000022h) a new COB-ID, transmission type, inhibit time or mapping while it is
+    valid. Its event timer may change at any time.
 
     Args:
-        dictionary: the node's objects.
-        node: its number.
-        number: 1 to 4.
-        words: mapping words of the factory.
+        dictionary: object dictionary of the node.
+        node: node number.
+        number: number of the TPDO, 1 to 4.
+        words: factory mapping words.
     """
 
     def __init__(self, dictionary: ObjectDictionary, node: int, number: int, words: tuple[int, ...]) -> None:
@@ -54,7 +54,7 @@ class Tpdo:
 
     @property
     def timer_ms(self) -> int:
-        """Event timer, 0 when off."""
+        """Event timer in ms; 0 if it is off."""
         return self._dictionary.value(self._communication, 5)
 
     @property
@@ -69,10 +69,10 @@ class Tpdo:
     def _type(self) -> int:
         return self._dictionary.value(self._communication, 2)
 
-    # When it is sent
+    # Sending
 
     def start(self, now_s: float) -> None:
-        """Start sending: the node became operational."""
+        """Start sending, because the node became operational."""
         self._now, self._syncs, self._last_data, self._last_sent_s = now_s, 0, b"", -math.inf
         self._schedule(now_s)
 
@@ -109,7 +109,7 @@ class Tpdo:
             return []
         due = self.due_s
         frame = self._send(self._data())
-        # Without drift, but without a burst for missed instants.
+        # Without drift, but also without a burst for missed instants
         self._schedule(due if now_s - due < self.timer_ms / 1e3 else now_s)
         return [frame]
 
@@ -131,7 +131,7 @@ class Tpdo:
             out += self._dictionary.entry(word >> 16, word >> 8 & 0xFF).encode()
         return out
 
-    # How it is changed
+    # Changing parameters
 
     def _changeable(self) -> None:
         if self._valid:
@@ -155,19 +155,19 @@ class Tpdo:
         self._dictionary.put(self._communication, 3, value)
 
     def write_timer(self, value: Value) -> None:
-        """Set the event timer (ms), as a write to 1800h.5 or to an alias of it does."""
+        """Set the event timer in ms, on a write to 1800h.5 or to an alias of it."""
         self._dictionary.put(self._communication, 5, value)
         self._schedule(self._now)
 
     def follow_node(self, old: int, new: int) -> None:
-        """Follow a changed node number, unless the COB-ID was set to another value."""
+        """Adapt the COB-ID to a changed node number, unless it was set to a non-default value."""
         cob_id = self._cob_id
         base = _COB_BASES[self.number - 1]
         if cob_id & 0x7FF == base + old:
             self._dictionary.put(self._communication, 1, cob_id & ~0x7FF | base + new)
 
     def _write_word(self, sub: int, value: Value) -> None:
-        # Allowed only while the count is 0.
+        # Allowed only while the count is 0
         self._changeable()
         if self._dictionary.value(self._mapping):
             raise AbortError(Abort.DEVICE_STATE)

@@ -1,4 +1,4 @@
-"""Timing of a serial line: bytes leave one after the other, and a command is heard when its last byte is."""
+"""Timing of a serial line: bytes are sent one after the other, and a command is received with its last byte."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from collections import deque
 from collections.abc import Callable
 
 BITS_PER_BYTE = 10  # 8N1 and 7E1 alike
-_GROUP = 16  # bytes handed over at a time; finer pacing would only wake the loop more often
+_GROUP = 16  # bytes passed on at a time; smaller groups would only wake the loop more often
 
 
 class Line:
-    """Outgoing bytes and things to do later, in the order of time.
+    """Queue of outgoing bytes and scheduled tasks, ordered by time.
 
     Args:
         baud: bits per second.
@@ -21,19 +21,19 @@ class Line:
     def __init__(self, baud: int) -> None:
         self.byte_s = BITS_PER_BYTE / baud
         self._out: deque[tuple[float, bytes, bool]] = deque()  # start, bytes, at once
-        self._sent = 0  # of the first chunk
+        self._sent = 0  # bytes of the first chunk already sent
         self._free_s = -math.inf
         self._heard_s = -math.inf
         self._tasks: list[tuple[float, int, Callable[[float], None]]] = []
         self._number = 0
 
     def send(self, at_s: float, data: bytes, *, at_once: bool = False) -> float:
-        """Queue bytes that start no earlier than `at_s`; returns when the last one is out.
+        """Queue bytes that start no earlier than `at_s`; return the time at which the last one is sent.
 
         Args:
             at_s: earliest start.
             data: the bytes.
-            at_once: hand them over in one piece when the last one is out, as a buffering radio modem does.
+            at_once: pass them on in one piece when the last one is sent, like a buffering radio modem.
         """
         start = max(at_s, self._free_s)
         self._free_s = start + len(data) * self.byte_s
@@ -41,17 +41,17 @@ class Line:
         return self._free_s
 
     def heard_at(self, now_s: float, count: int) -> float:
-        """Instant at which the last of `count` bytes, written by the host now, has arrived."""
+        """Return the instant at which the last of `count` bytes that the host writes at `now_s` has arrived."""
         self._heard_s = max(now_s, self._heard_s) + count * self.byte_s
         return self._heard_s
 
     def later(self, at_s: float, task: Callable[[float], None]) -> None:
-        """Schedule a task for an instant, which it is given."""
+        """Schedule a task for an instant, which is passed to the task."""
         self._number += 1
         heapq.heappush(self._tasks, (at_s, self._number, task))
 
     def poll(self, now_s: float) -> bytes:
-        """Run the tasks that are due; returns the bytes that have left by now."""
+        """Run the tasks that are due; return the bytes that have been sent by now."""
         while self._tasks and self._tasks[0][0] <= now_s:
             at_s, _, task = heapq.heappop(self._tasks)
             task(at_s)
@@ -70,7 +70,7 @@ class Line:
         return out
 
     def next_deadline(self) -> float:
-        """Instant at which `poll` is due."""
+        """Return the instant at which `poll` is due."""
         due = self._tasks[0][0] if self._tasks else math.inf
         if self._out:
             start, data, at_once = self._out[0]

@@ -17,7 +17,7 @@ _LONGEST_COMMAND = 80
 _SET_CIRCLE = re.compile(rb"/Dc (\d{1,3})\.(\d{2})(\d{2})")
 _INPUT = re.compile(rb"(/D[a-z] [^,]*(?:,[^,]*)*?)(?:,([0-9A-F]{2}))?")
 
-# EDM mode -> (seconds a measurement takes, repeats until it is stopped)
+# EDM mode -> (duration of a measurement in seconds, repeats until stopped)
 _EDM = {
     b"Xa": (_FINE_S, False),
     b"Xb": (_FINE_S, True),
@@ -34,8 +34,8 @@ class SokkiaStation(TotalStation):
 
     Args:
         settings: profile `sokkia_set`.
-        tracker: its telescope.
-        rng: clutter on the line.
+        tracker: telescope of the station.
+        rng: random generator for garbage on the line.
     """
 
     def __init__(self, settings: StationSettings, tracker: Tracker, rng: np.random.Generator) -> None:
@@ -57,7 +57,7 @@ class SokkiaStation(TotalStation):
             del self._buffer[:-_LONGEST_COMMAND]
 
     def _measure(self, request: bytes, at_s: float) -> None:
-        self._measuring += 1  # which stops the measurement under way
+        self._measuring += 1  # stops the measurement in progress
         if request == b"\x12":
             return
         if request in b"\x00\x13":
@@ -95,7 +95,7 @@ class SokkiaStation(TotalStation):
         self._line.send(at_s + self.settings.ack_s, ACK if done else NAK)
 
     def _set(self, command: bytes, at_s: float) -> bool:
-        """Apply a setting; True if it was understood."""
+        """Apply a setting; return True if the command is valid."""
         if command in _EDM:
             self._mode = command
             return True
@@ -103,7 +103,7 @@ class SokkiaStation(TotalStation):
             self.set_circle(0.0, at_s)
             return True
         if command in (b"Xk", b"Xl"):
-            return command == b"Xk"  # angles to the right is all that this instrument does
+            return command == b"Xk"  # this instrument only supports angles to the right
         given = _INPUT.fullmatch(command)
         if given is None:
             return False

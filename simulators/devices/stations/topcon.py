@@ -1,4 +1,4 @@
-"""Topcon stations: the GTS handshake with the classic commands, and those of the robotic GTS-8 family."""
+"""Topcon stations: the GTS handshake with the classic commands and the commands of the robotic GTS-8 family."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ from simulators.devices.stations.total_station import StationSettings, TotalStat
 from simulators.devices.stations.tracker import Tracker
 
 _HOST_ACK_S = 0.3
-_RETRY_S = 0.5  # a shot that found no prism is tried again
+_RETRY_S = 0.5  # pause before a retry if no prism was found
 _LONGEST_COMMAND = 40
 _TURN = re.compile(r"(T1[013])([+-]\d{7})([+-]\d{7})d")
 _SET_CIRCLE = re.compile(r"(?:J|ZB1)\+(\d{5,7})d")
 _SETTING = re.compile(r"Z[BCD][0-9+-].*|Z\d\d")
 
-# mode command -> (record, seconds that a shot takes beyond tracking mode)
+# mode command -> (record, seconds that a measurement takes longer than in tracking mode)
 _MODES: dict[str, tuple[Callable[[Sight], bytes], float]] = {
     "Z12": (angle_record, 0.0),
     "Z20": (angle_record, 0.0),
@@ -47,17 +47,17 @@ class TopconStation(TotalStation):
 
     Args:
         settings: profile `topcon_gts8` or `topcon_classic`.
-        tracker: its telescope.
-        rng: clutter on the line.
+        tracker: telescope of the station.
+        rng: random generator for garbage on the line.
     """
 
     def __init__(self, settings: StationSettings, tracker: Tracker, rng: np.random.Generator) -> None:
         super().__init__(settings, tracker, rng)
         self._buffer = bytearray()
         self._mode = "Z34"
-        self._measuring = 0  # number of the measurement under way; another number stops it
+        self._measuring = 0  # number of the measurement in progress; a change stops it
         self._awaiting_ack = 0
-        self._pending_ack = b""  # one that is held back to arrive with its record
+        self._pending_ack = b""  # held back to arrive together with its record
 
     def _hear(self, byte: bytes, at_s: float) -> None:
         if byte in b"\r\n":
@@ -102,7 +102,7 @@ class TopconStation(TotalStation):
             self._acknowledge(at_s)
 
     def _obey_robotic(self, command: str, at_s: float) -> bool:
-        """True when the command belongs to the robotic family."""
+        """Carry out a command of the robotic family; return False if it is not one."""
         turn = _TURN.fullmatch(command)
         if command == "C11":
             self._measure(at_s, tracking_record, 0.0, needs_distance=False)
@@ -128,13 +128,13 @@ class TopconStation(TotalStation):
         return True
 
     def _turn(self, command: re.Match[str], at_s: float) -> None:
-        # Both arguments are relative: vertical = now - target, horizontal = target - now.
+        # Both arguments are relative: vertical = now - target, horizontal = target - now
         now = self.tracker.point(at_s)
         hz, zenith = now.hz_deg + from_dms(command[3]), now.zenith_deg - from_dms(command[2])
         self.tracker.turn(hz, max(0.0, min(180.0, zenith)), at_s, search=command[1] == "T13")
 
     def _acknowledge(self, at_s: float) -> float:
-        """Send ACK unless it gets lost; returns when it is out."""
+        """Send ACK unless it gets lost; return when it is sent."""
         start = at_s + self.settings.ack_s
         if self.faults.dropped_acks > 0:
             self.faults.dropped_acks -= 1

@@ -1,6 +1,6 @@
 """Records of Topcon-type stations: frames with their block check, angles in degrees-minutes-seconds.
 
-Written for the simulator alone; the drivers have their own reader of the same format.
+Written only for the simulator; the drivers have an independent reader of the same format.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ _REFRACTION = 0.20
 
 @dataclass(frozen=True)
 class Sight:
-    """One measurement as the instrument displays it.
+    """One measurement as displayed by the instrument.
 
     Attributes:
         hz_deg, zenith_deg: circle readings, 0 to below 360.
-        slope_m: displayed slope distance; 0 while there is none.
+        slope_m: displayed slope distance; 0 if there is none.
         tilt_ok: the compensator works.
         edm_level: strength of the returned signal, 0 to 99.
-        ppm, prism_mm: the corrections that are set.
+        ppm, prism_mm: corrections set on the instrument.
         battery: 0 to 9.
         tracking: tracking flag of robotic stations, 0 to 6.
         face: 1 or 2.
@@ -46,7 +46,7 @@ class Sight:
 
     @property
     def horizontal_m(self) -> float:
-        """Horizontal distance reduced for curvature and refraction."""
+        """Horizontal distance, corrected for curvature and refraction."""
         V = math.radians(self.zenith_deg)
         level = self.slope_m * math.sin(V)
         bend = (1 - _REFRACTION / 2) * self.slope_m**2 * math.sin(V) * math.cos(V) / _EARTH_RADIUS_M
@@ -54,7 +54,7 @@ class Sight:
 
 
 def frame(data: bytes, *, crlf: bool) -> bytes:
-    """`data` with its block check (XOR of all bytes as three decimal digits) and its end."""
+    """Return `data` with its block check (XOR of all bytes as three decimal digits) and terminator."""
     return data + _check(data) + ETX + (b"\r\n" if crlf else b"")
 
 
@@ -69,7 +69,7 @@ def _check(data: bytes) -> bytes:
 
 
 def dms(degrees: float, *, tenths: bool) -> str:
-    """DDDMMSS, or DDDMMSSs with tenths of a second."""
+    """Format degrees as DDDMMSS, or as DDDMMSSs with tenths of a second."""
     scale = 36000 if tenths else 3600
     units = round(degrees * scale) % (360 * scale)
     per_second = 10 if tenths else 1
@@ -80,7 +80,7 @@ def dms(degrees: float, *, tenths: bool) -> str:
 
 
 def from_dms(text: str) -> float:
-    """Degrees of DDDMMSS or DDDMMSSs, with or without a sign."""
+    """Parse DDDMMSS or DDDMMSSs, with or without a sign, as degrees."""
     sign = -1.0 if text.startswith("-") else 1.0
     digits = text.lstrip("+-")
     seconds = int(digits[5:7]) + (int(digits[7]) / 10 if len(digits) > 7 else 0.0)
@@ -94,7 +94,7 @@ def _signed(value: float, digits: int) -> str:
 
 
 def _distance_record(s: Sight, *, is_fine: bool) -> str:
-    """Slope and horizontal distance, angles and corrections: in 0.1 mm and 0.1 arc second if fine, else mm and 1."""
+    """Return distances, angles and corrections, in 0.1 mm and 0.1 arc second if fine, else in 1 mm and 1 arc second."""
     if is_fine:
         per_m, digits, corrections = 1e4, 9, _signed(s.ppm * 10, 4) + _signed(s.prism_mm * 10, 3)
     else:
@@ -106,33 +106,33 @@ def _distance_record(s: Sight, *, is_fine: bool) -> str:
 
 
 def tracking_record(s: Sight) -> bytes:
-    """`Q`: a robotic station's slope distance record."""
+    """Return a `Q` record: slope distance of a robotic station."""
     state = f"{s.battery}0{s.tracking}{'r' if s.face == 1 else 'l'}"
     return f"Q{_distance_record(s, is_fine=True)}{state}".encode("ascii")
 
 
 def tracking_angles(s: Sight) -> bytes:
-    """`Q` with angles alone, the answer to `C31`."""
+    """Return a `Q` record with only angles, the answer to `C31`."""
     return f"Q{dms(s.zenith_deg, tenths=True)}+{dms(s.hz_deg, tenths=True)}d".encode("ascii")
 
 
 def fine_record(s: Sight) -> bytes:
-    """`(`: slope distance in fine mode."""
+    """Return a `(` record: slope distance in fine mode."""
     return f"({_distance_record(s, is_fine=True)}**".encode("ascii")
 
 
 def coarse_record(s: Sight) -> bytes:
-    """`?`: slope distance in coarse mode."""
+    """Return a `?` record: slope distance in coarse mode."""
     return f"?{_distance_record(s, is_fine=False)}".encode("ascii")
 
 
 def angle_record(s: Sight) -> bytes:
-    """`<`: circle readings alone."""
+    """Return a `<` record: only circle readings."""
     return f"<{dms(s.zenith_deg, tenths=False)}+{dms(s.hz_deg, tenths=False)}+0000d".encode("ascii")
 
 
 def coordinate_record(s: Sight) -> bytes:
-    """`U`: north, east and height of the target from the instrument's centre, mm."""
+    """Return a `U` record: north, east and height of the target from the instrument's centre, mm."""
     V, H = math.radians(s.zenith_deg), math.radians(s.hz_deg)
     level = s.slope_m * math.sin(V)
     north, east, up = level * math.cos(H), level * math.sin(H), s.slope_m * math.cos(V)
@@ -141,12 +141,12 @@ def coordinate_record(s: Sight) -> bytes:
 
 
 def set_record(s: Sight, *, checksum: bool) -> bytes:
-    """A Sokkia SET reply: slope distance in mm, zenith and horizontal angle DDDMMSS; E200 for no distance."""
+    """Return a Sokkia SET reply: slope distance in mm, zenith and horizontal angle DDDMMSS; E200 for no distance."""
     distance = f"{round(s.slope_m * 1e3):07d}" if s.slope_m else "E200"
     text = f"{distance} {dms(s.zenith_deg, tenths=False)} {dms(s.hz_deg, tenths=False)}".encode("ascii")
     return set_line(text + b" ", checksum=True) if checksum else text + b"\r\n"
 
 
 def set_line(text: bytes, *, checksum: bool) -> bytes:
-    """A SET line: `text` with its separator, the sum of all its bytes as two hexadecimal digits, CR LF."""
+    """Return a SET line: `text` with its separator, the sum of its bytes as two hexadecimal digits, CR LF."""
     return text + (b"%02X" % (sum(text) % 256) if checksum else b"") + b"\r\n"

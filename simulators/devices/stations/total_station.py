@@ -1,7 +1,7 @@
 """A total station on a serial line: its settings, its measurements, and faults of its answers.
 
-The protocols are in `topcon.py` and `sokkia.py`. Sans-IO: bytes and the time go in, bytes come out at
-the pace of the line. Times are simulated seconds.
+The protocols are in `topcon.py` and `sokkia.py`. A station does no I/O: it takes bytes and the time, and returns bytes
+at the speed of the line. Times are simulated seconds.
 """
 
 from __future__ import annotations
@@ -26,21 +26,22 @@ class StationSettings:
     """Settings in the instrument's menus, and its timing.
 
     Attributes:
-        profile: which protocol it speaks.
-        baud: of its serial line.
-        crlf: it ends its frames with CR LF (Topcon).
-        checksum: it ends its replies with a sum (Sokkia).
-        ack_s: from a command to the start of its acknowledgement.
-        measure_s: from the acknowledgement to the start of the record, tracking EDM mode; fine single shots and
-            coarse ones of classic instruments take 1.5 s and 0.7 s more.
-        latency_s: how old a measurement is when its record starts.
+        profile: protocol of the instrument.
+        baud: baud rate of its serial line.
+        crlf: frames end with CR LF (Topcon).
+        checksum: replies end with a sum (Sokkia).
+        ack_s: time from a command to the start of its acknowledgement.
+        measure_s: time from the acknowledgement to the start of the record in tracking EDM mode; fine and coarse single
+            measurements of classic instruments take 1.5 s and 0.7 s longer.
+        latency_s: age of a measurement when its record starts.
         nak_bad_check: answer a wrong block check with NAK instead of silence.
-        retransmissions: repetitions of a record that the host does not acknowledge within 0.3 s.
+        retransmissions: number of repetitions of a record that the host does not acknowledge within 0.3 s.
         stale_distance: while coasting, repeat the last distance instead of 0.
-        prism_mm, ppm: the corrections that are set; the displayed distance has them applied.
-        prism_true_mm, ppm_true: what would be right for the prism and the air.
-        push_interval_s: send records unasked at this interval (passive listening); None: only when asked.
-        tracker: the servo's settings.
+        prism_mm, ppm: corrections set on the instrument and applied to the displayed distance.
+        prism_true_mm, ppm_true: correct values for the prism and the air.
+        push_interval_s: interval at which records are sent without request (passive listening); None to send only on
+            request.
+        tracker: settings of the servo.
     """
 
     profile: Profile = "topcon_gts8"
@@ -63,14 +64,14 @@ class StationSettings:
 
 @dataclass
 class StationFaults:
-    """Faults to come, counted down as they happen.
+    """Pending faults, counted down as they occur.
 
     Attributes:
-        bad_checks: records that leave with a wrong check.
-        dropped_acks: commands that are not acknowledged.
-        joined: acknowledgements that arrive with their record in one buffer, their own first byte and end lost.
-        clutter: random bytes before the next record.
-        silent_until: neither hears nor sends until then.
+        bad_checks: number of records to send with a wrong check.
+        dropped_acks: number of commands to leave unacknowledged.
+        joined: number of acknowledgements to send in one buffer with their record, without their first byte and end.
+        clutter: number of random bytes to send before the next record.
+        silent_until: the station neither receives nor sends before this instant.
     """
 
     bad_checks: int = 0
@@ -84,10 +85,10 @@ class TotalStation(ABC):
     """Base of all instruments: line, telescope, circles, distance meter.
 
     Attributes:
-        settings, faults: see there.
+        settings, faults: see StationSettings and StationFaults.
         tracker: the telescope.
         circle_zero_deg: direction from north at which the horizontal circle reads 0.
-        on_measured: called with the target and the instant of each distance that is measured; None: not called.
+        on_measured: called with target and instant for each measured distance; None for no call.
     """
 
     def __init__(self, settings: StationSettings, tracker: Tracker, rng: np.random.Generator) -> None:
@@ -110,27 +111,27 @@ class TotalStation(ABC):
         return self.settings.profile != "topcon_classic"
 
     def receive(self, data: bytes, now_s: float) -> None:
-        """Take bytes that the host wrote."""
+        """Process bytes written by the host."""
         if now_s < self.faults.silent_until:
             return
         for i in range(len(data)):
             self._hear(data[i : i + 1], self._line.heard_at(now_s, 1))
 
     def poll(self, now_s: float) -> bytes:
-        """Return the bytes that have left the instrument by now."""
+        """Return the bytes that the instrument has sent by now."""
         out = self._line.poll(now_s)
         return b"" if now_s < self.faults.silent_until else out
 
     def next_deadline(self) -> float:
-        """Instant at which `poll` is due."""
+        """Return the instant at which `poll` is due."""
         return self._line.next_deadline()
 
     def aim_at(self, name: str, now_s: float) -> None:
-        """Point at a target as an operator does, and lock on it if the instrument can; ValueError if there is none."""
+        """Point at a target like an operator, and lock on it if the instrument can; ValueError if it is unknown."""
         self.tracker.aim_at(name, now_s, track=self.robotic)
 
     def sight(self, now_s: float) -> Sight:
-        """Measure."""
+        """Measure in the direction of the telescope."""
         settings = self.settings
         flag = self.tracker.flag(now_s)
         pointing = self.tracker.point(now_s)
@@ -163,16 +164,16 @@ class TotalStation(ABC):
         self._face = 3 - self._face
 
     def set_circle(self, reading_deg: float, now_s: float) -> None:
-        """Make the horizontal circle read this where it points now (face 1)."""
+        """Set the horizontal circle so that it reads `reading_deg` in the current direction (face 1)."""
         self.circle_zero_deg = (self.tracker.point(now_s).hz_deg - reading_deg) % 360
 
     @abstractmethod
     def _hear(self, byte: bytes, at_s: float) -> None:
-        """Take one byte of the host's at an instant."""
+        """Process one byte from the host at an instant."""
 
     @abstractmethod
     def _measurement(self, at_s: float) -> bytes:
-        """Return the record that is sent unasked."""
+        """Return a record to send without request."""
 
     def _push(self, at_s: float) -> None:
         if self._on:
@@ -181,7 +182,7 @@ class TotalStation(ABC):
             self._line.later(at_s + self.settings.push_interval_s, self._push)
 
     def _send_record(self, at_s: float, record: bytes) -> float:
-        """Send a finished record with whatever goes wrong; returns when it is out."""
+        """Send a finished record with pending faults applied; return when it is sent."""
         faults = self.faults
         if faults.bad_checks > 0:
             faults.bad_checks -= 1
@@ -193,6 +194,6 @@ class TotalStation(ABC):
 
     @staticmethod
     def _spoilt(record: bytes) -> bytes:
-        """Change one digit of a record's distance, so that its check no longer fits."""
+        """Change one digit of a record's distance, so that its check becomes wrong."""
         place = next(i for i, byte in enumerate(record) if chr(byte).isdigit()) + 5
         return record[:place] + bytes([record[place] ^ 0x01]) + record[place + 1 :]

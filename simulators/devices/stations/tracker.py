@@ -1,7 +1,8 @@
 """The servo of a robotic station: pointing, lock on a prism, loss and search.
 
-Sequence on a loss of lock, as the instruments have it: coast on the last motion (still "tracking"), wait, search
-around the place of the loss, lock again; and again while nothing is found. Times are simulated seconds.
+After a loss of lock the servo behaves like real instruments: it coasts on the last motion (still "tracking"), waits,
+searches around the place of the loss and locks again. It repeats this until something is found. Times are simulated
+seconds.
 """
 
 from __future__ import annotations
@@ -21,9 +22,9 @@ Floats = NDArray[np.float64]
 # (target, simulated seconds) -> (3,) mm from the instrument's centre: east, north, up
 TargetPosition = Callable[[str, float], Floats]
 
-_ON_AXIS_DEG = 0.05  # the distance meter's beam is this narrow
+_ON_AXIS_DEG = 0.05  # half width of the distance meter's beam
 _SERVO_DEG_PER_S = 60.0
-_OPERATOR_S = 1.0  # to find the target in the telescope
+_OPERATOR_S = 1.0  # time to find the target in the telescope
 
 
 class Flag(IntEnum):
@@ -41,7 +42,7 @@ class TrackerSettings:
     """Timing and range of the servo's search.
 
     Attributes:
-        prediction_s: duration of coasting on the last motion after a loss of sight.
+        prediction_s: duration of coasting on the last motion after the sight is lost.
         wait_s: pause between coasting and search.
         search_s: duration of one search.
         search_range_deg: half width of the search around the place of the loss, in both circles.
@@ -55,10 +56,10 @@ class TrackerSettings:
 
 @dataclass(frozen=True)
 class Pointing:
-    """A direction, and the distance along it if there is an echo: deg from north, deg from up, mm.
+    """A direction (deg from north, deg from up), and the distance in mm if there is an echo.
 
     Attributes:
-        target: what echoes.
+        target: name of the target that returns the echo.
     """
 
     hz_deg: float
@@ -71,10 +72,10 @@ class Tracker:
     """A servo-driven telescope with automatic target recognition.
 
     Args:
-        names: targets in the field, in the order of preference when two are equally near.
-        position: where a target is at an instant.
+        names: targets in the field; of two equally near targets the first is preferred.
+        position: function that returns the position of a target at an instant.
         noise: random errors of circles, distance and target.
-        rng: their source.
+        rng: random generator.
         settings: see TrackerSettings.
     """
 
@@ -89,29 +90,29 @@ class Tracker:
         self._names, self._position, self._noise, self._rng = tuple(names), position, noise, rng
         self._settings = settings
         self._flag = Flag.STANDBY
-        self._until = math.inf  # when the present phase ends of itself
+        self._until = math.inf  # end of the current phase
         self._search_after_turn = True
         self._target: str | None = None
-        self._wanted: str | None = None  # the target that the operator turns it to
-        self._lost_at: float | None = None  # out of sight since then, while it still counts as locked
+        self._wanted: str | None = None  # the target to which the operator turns
+        self._lost_at: float | None = None  # when the target went out of sight, while the flag is still LOCKED
         self._blocked_until = -math.inf
         self._aim = (0.0, 90.0)
 
     def target(self, now_s: float) -> str | None:
-        """Name of the target that it is locked on; None if there is none."""
+        """Return the name of the target that the telescope is locked on, or None."""
         self._advance(now_s)
         return self._target
 
     def flag(self, now_s: float) -> Flag:
-        """Tracking flag at an instant."""
+        """Return the tracking flag at an instant."""
         self._advance(now_s)
         return self._flag
 
     def aim_at(self, name: str, now_s: float, *, track: bool) -> None:
-        """Turn to a target, as an operator does: `track` locks on it when it is there, else it stays in standby.
+        """Turn to a target like an operator; with `track` lock on it on arrival, else stay in standby.
 
         Raises:
-            ValueError: no such target.
+            ValueError: the target is unknown.
         """
         if name not in self._names:
             raise ValueError(f"no target {name!r}; there are {', '.join(self._names)}")
@@ -125,17 +126,17 @@ class Tracker:
             self._set(Flag.STANDBY, math.inf)
 
     def block(self, now_s: float, until_s: float) -> None:
-        """Something stands in the line of sight until then."""
+        """Block the line of sight until `until_s`."""
         self._advance(now_s)
         self._blocked_until = until_s
         if self._flag is Flag.LOCKED and self._lost_at is None:
             self._lost_at = now_s
 
     def jump(self, name: str, now_s: float) -> None:
-        """Follow another target from now on, unreported: two prisms passed each other in the field of view.
+        """Follow a different target from now on without reporting it, as when two prisms pass in the field of view.
 
         Raises:
-            ValueError: no such target.
+            ValueError: the target is unknown.
         """
         if name not in self._names:
             raise ValueError(f"no target {name!r}; there are {', '.join(self._names)}")
@@ -144,19 +145,26 @@ class Tracker:
             self._target = name
 
     def track(self, now_s: float) -> None:
-        """Tracking on: keep a lock, else search where it points."""
+        """Switch tracking on: keep a lock, else search around the current direction."""
         self._advance(now_s)
         if self._flag is Flag.STANDBY:
             self._set(Flag.SEARCHING, now_s + self._settings.search_s)
 
     def stand_by(self, now_s: float) -> None:
-        """Servo still, no tracking."""
+        """Stop the servo and tracking."""
         self._advance(now_s)
         self._set(Flag.STANDBY, math.inf)
         self._target = self._wanted = None
 
     def turn(self, hz_deg: float, zenith_deg: float, now_s: float, *, search: bool) -> None:
-        """Rotate to a direction, then search there or stand by."""
+        """Rotate to a direction, then search there or stand by.
+
+        Args:
+            hz_deg: horizontal direction, clockwise from north.
+            zenith_deg: zenith angle.
+            now_s: current time, simulated seconds.
+            search: search for a prism on arrival, else stand by.
+        """
         self._advance(now_s)
         way = max(abs((hz_deg - self._aim[0] + 180) % 360 - 180), abs(zenith_deg - self._aim[1]))
         self._aim = (hz_deg % 360, zenith_deg)
@@ -164,7 +172,7 @@ class Tracker:
         self._set(Flag.ROTATING, now_s + way / _SERVO_DEG_PER_S + 0.5)
 
     def point(self, now_s: float) -> Pointing:
-        """Measure: where the telescope points at an instant, with the errors of circles, distance and target."""
+        """Measure the direction of the telescope at an instant, with the errors of circles, distance and target."""
         self._advance(now_s)
         visible = now_s >= self._blocked_until
         if self._flag is Flag.LOCKED and self._target is not None and visible:
@@ -197,7 +205,7 @@ class Tracker:
         self._flag, self._until = flag, until_s
 
     def _advance(self, now_s: float) -> None:
-        """Live through everything that happens by itself up to now."""
+        """Carry out all phase changes that are due up to now."""
         while self._step(now_s):
             pass
 
@@ -208,7 +216,7 @@ class Tracker:
                 return False
             end = self._lost_at + settings.prediction_s
             if now_s >= self._blocked_until and self._blocked_until <= end:
-                self._lost_at = None  # in sight again before the coasting was over
+                self._lost_at = None  # in sight again before the end of coasting
                 return False
             if now_s < end:
                 return False

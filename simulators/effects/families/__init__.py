@@ -1,1 +1,1 @@
-"""Effects that a library of physical effects names, in files by the place at which they act."""
+"""Effects that the library of physical effects contains, in modules by the place at which they act."""

@@ -1,4 +1,4 @@
-"""A carrier that leans, sinks, slips or is pushed: effects at the base."""
+"""Effects at the base: a carrier that leans, sinks, slips or is pushed."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from simulators.effects.base import Bend, Body, DrawContext, Effect, hours_since
 
 @dataclass(frozen=True)
 class BaseCompliance(Effect):
-    """A carrier on springs: it leans to where its boom weighs.
+    """A carrier on springs: it leans to the side that its boom loads.
 
-    Tilt about the base's origin, about its x and y axes, in proportion to the moment of all weights about each.
+    Tilt about the x and y axes through the base's origin, proportional to the moment of all weights about each axis.
 
     Attributes:
-        x_rad_per_Nm, y_rad_per_Nm: of the springs.
+        x_rad_per_Nm, y_rad_per_Nm: compliance of the springs about each axis.
     """
 
     amplitudes: ClassVar[Mapping[str, float]] = {"x_rad_per_Nm": 15e-3, "y_rad_per_Nm": 15e-3}
@@ -38,13 +38,13 @@ class BaseCompliance(Effect):
 class BaseSettlement(Effect):
     """Ground that gives way: the carrier sinks and tilts steadily.
 
-    Tilts about the x and y axes of the base's frame through its origin, and z along its z axis, growing with time.
+    Tilts about the x and y axes of the base's frame through its origin, and a shift along z, proportional to time.
 
-    Time is that of the column `time_s`.
+    Time is the column `time_s`.
 
     Attributes:
         tilt_x_rad_per_h, tilt_y_rad_per_h, z_mm_per_h: the rates.
-        first_s: the instant from which it counts; None: the earliest of the rows given.
+        first_s: time at which the effect is zero; None for the earliest time of the given rows.
     """
 
     amplitudes: ClassVar[Mapping[str, float]] = {"tilt_x_rad_per_h": 1e-3, "tilt_y_rad_per_h": 1e-3, "z_mm_per_h": 5.0}
@@ -64,11 +64,11 @@ class BaseSettlement(Effect):
 
 @dataclass(frozen=True)
 class BaseShift(Effect):
-    """A carrier that is pushed: from one instant on it stands elsewhere on the ground, and heads elsewhere.
+    """A carrier that is pushed: from one instant on it has a different position and heading on the ground.
 
-    After `time_s` (column `time_s`) a turn about the z axis of the base's frame, and shifts along its x and y.
+    After `time_s` (column `time_s`) a rotation about the z axis of the base's frame, and shifts along its x and y.
 
-    The turn is about the base's origin.
+    The rotation is about the base's origin.
     """
 
     amplitudes: ClassVar[Mapping[str, float]] = {"x_mm": 50.0, "y_mm": 50.0, "heading_rad": 10e-3}
@@ -93,9 +93,9 @@ class BaseShift(Effect):
 
 @dataclass(frozen=True)
 class BaseStep(Effect):
-    """A jack that slips: from one instant on the carrier stands otherwise.
+    """A jack that slips: from one instant on the carrier has a different height and tilt.
 
-    After `time_s` (column `time_s`) tilts about the x and y axes of the base's frame, and z along its z axis.
+    After `time_s` (column `time_s`) tilts about the x and y axes of the base's frame, and a shift along its z axis.
 
     The tilts are about the base's origin.
     """

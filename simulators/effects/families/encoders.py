@@ -11,12 +11,12 @@ import numpy as np
 from calibration.rig.description import Rig
 from simulators.effects.base import Body, DrawContext, Effect, Floats, step_time_s
 
-_MOST_CYCLES = 10_000  # a turn, far beyond any encoder's lines that a joint could show
+_MOST_CYCLES = 10_000  # cycles per turn, far more than the visible lines of any encoder
 
 
 @dataclass(frozen=True)
 class AngleScale(Effect):
-    """An encoder whose scale is off.
+    """An encoder with a wrong scale.
 
     d_theta = scale * theta as read, from the zero of the reading; 1e-3 is 0.9 mrad at 50 deg.
     """
@@ -32,7 +32,7 @@ class AngleScale(Effect):
 
 @dataclass(frozen=True)
 class EncoderHarmonic(Effect):
-    """An encoder that sits off its axis: an error that repeats k times a turn.
+    """An eccentric encoder: an error that repeats k times per turn.
 
     True angle - read angle = A cos(k theta) + B sin(k theta), theta the true angle.
 
@@ -55,7 +55,7 @@ class EncoderHarmonic(Effect):
     def joint_change(self, body: Body) -> Floats:
         read = body.read[self.where]
         change = np.zeros_like(read)
-        # The disc's error belongs to the shaft's true angle; the fixed point is reached to 1e-9 rad in three rounds.
+        # The disc's error depends on the shaft's true angle; three iterations reach the fixed point to 1e-9 rad
         for _ in range(3):
             true = read + change
             change = self.cosk_rad * np.cos(self.k * true) + self.sink_rad * np.sin(self.k * true)
@@ -72,13 +72,13 @@ class JointErrorMap(Effect):
 
     True angle - read angle = a curve of the angle as read, drawn once from `seed`.
 
-    With `lines` 0 a smooth random curve (of Gaussian correlation over `length_deg`), else a sum of that many cycles of
-    equal size whose numbers a turn are drawn from 3 to `highest`.
+    If `lines` is 0, this is a smooth random curve with Gaussian correlation over `length_deg`, else a sum of `lines`
+    cosines of equal size with 3 to `highest` cycles per turn.
 
     Attributes:
-        rms_rad: its root mean square between the joint's limits, about its mean.
+        rms_rad: root mean square of the curve about its mean, between the joint's limits.
         length_deg: correlation length.
-        lines, highest: of the cycles.
+        lines, highest: number of cosines, and their largest number of cycles per turn.
         seed: the same seed draws the same curve.
     """
 
@@ -100,9 +100,9 @@ class JointErrorMap(Effect):
             )
 
     def draw_shape(self, data: DrawContext, rng: np.random.Generator) -> Effect:
-        """Draw a smooth curve of some five swells over the joint's range, or two sharp cycles that turn over in it."""
+        """Draw a smooth curve with about five waves over the joint's range, or a sum of two cosines."""
         low, high = data.rig.joint(self.where).limits
-        once = 360.0 / min(high - low, 360.0)  # cycles a turn that make one cycle of the range
+        once = 360.0 / min(high - low, 360.0)  # cycles per turn that give one cycle over the range
         return replace(
             self,
             seed=int(rng.integers(1 << 31)),
@@ -124,7 +124,7 @@ class JointErrorMap(Effect):
         rng = np.random.default_rng([self.seed, 71])
         if self.lines:
             cycles = rng.choice(np.arange(3, self.highest + 1), self.lines, replace=False).astype(float)
-        else:  # cosines whose frequencies are drawn from the spectrum of a Gaussian correlation
+        else:  # cosines with frequencies from the spectrum of a Gaussian correlation
             cycles = rng.normal(0.0, 1.0 / np.deg2rad(self.length_deg), _WAVES)
         return cycles, rng.uniform(0.0, 2 * np.pi, len(cycles))
 
@@ -136,9 +136,9 @@ def _curve(angle: Floats, cycles: Floats, phase: Floats) -> Floats:
 
 @dataclass(frozen=True)
 class ZeroStep(Effect):
-    """An encoder that slips on its shaft: from one instant on the joint's zero is another one.
+    """An encoder that slips on its shaft: from one instant on the joint's zero is different.
 
-    d_theta = jump for every instant after `time_s` (column `time_s`).
+    d_theta = jump at all times after `time_s` (column `time_s`).
     """
 
     amplitudes: ClassVar[Mapping[str, float]] = {"jump_rad": 35e-3}

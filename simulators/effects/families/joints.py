@@ -1,4 +1,4 @@
-"""Joints that turn by something else than their encoder says: play, friction, leakage and compliance."""
+"""Joints that turn by a different angle than their encoder reads: play, friction, leakage and compliance."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from simulators.effects.base import Body, Effect, Floats
 
 @dataclass(frozen=True)
 class Backlash(Effect):
-    """Play between encoder and joint: the encoder lags behind the joint by half the play, on the side it came from.
+    """Play between encoder and joint: the encoder lags behind the joint by half the play in the direction of motion.
 
     d_theta = width / 2 * direction of the last motion (column `<joint>_dir`).
     """
@@ -29,9 +29,9 @@ class Backlash(Effect):
 
 @dataclass(frozen=True)
 class GravityFlipPlay(Effect):
-    """Clearance in a joint that always rests on the side gravity pushes it to.
+    """Clearance in a joint that always rests on the side to which gravity pushes it.
 
-    d_theta = width / 2 * sign(torque), the torque that of the deflected posture.
+    d_theta = width / 2 * sign(torque), with the torque in the deflected posture.
     """
 
     amplitudes: ClassVar[Mapping[str, float]] = {"width_rad": 5e-3}
@@ -45,18 +45,18 @@ class GravityFlipPlay(Effect):
 
 @dataclass(frozen=True)
 class LoadHysteresis(Effect):
-    """Friction that grows with the load: an encoder stops short of its joint on the side it came from, by the load.
+    """Friction that grows with the load: an encoder stops short of its joint's last motion by an angle due to the load.
 
-    d_theta = k * direction * |torque| * (1 + s exp(-(rate / v)^2)), the torque that of the deflected posture.
+    d_theta = k * direction * |torque| * (1 + s exp(-(rate / v)^2)), with the torque in the deflected posture.
 
-    Coulomb friction in a loaded bearing or slide pad holds the encoder's side back, and what lies between it and the
-    link winds up: the link comes to rest further along its last motion (column `<joint>_dir`) than its encoder says. At
-    creeping speed it rises by the share s of stiction (Stribeck's curve, with his speed v; Armstrong-Helouvry, Dupont
-    and Canudas de Wit, Automatica 30, 1994); it needs `<joint>_rate` then.
+    Coulomb friction in a loaded bearing or slide pad holds the encoder's side back, and the parts between it and the
+    link wind up: the link comes to rest farther along its last motion (column `<joint>_dir`) than its encoder reads. At
+    creeping speed friction rises by the share s of stiction (Stribeck's curve with Stribeck speed v;
+    Armstrong-Helouvry, Dupont and Canudas de Wit, Automatica 30, 1994); the column `<joint>_rate` is then needed.
 
     Attributes:
         rad_per_Nm: k; 4e-9 at a joint that carries 250 kN m is 1 mrad.
-        stiction_share: s; 0 is friction that does not care for the speed.
+        stiction_share: s; 0 for friction that does not depend on the speed.
         stribeck_deg_per_s: v.
     """
 
@@ -84,7 +84,7 @@ class JointCompliance(Effect):
     d_theta = compliance * torque, in the deflected posture.
 
     Attributes:
-        compliance_rad_per_Nm: 5e-9 at a joint that carries 250 kN m is about 1.2 mrad.
+        compliance_rad_per_Nm: the compliance; 5e-9 at a joint that carries 250 kN m is about 1.2 mrad.
     """
 
     amplitudes: ClassVar[Mapping[str, float]] = {"compliance_rad_per_Nm": 20e-3}
@@ -99,7 +99,7 @@ class JointCompliance(Effect):
 
 @dataclass(frozen=True)
 class PayloadChange(Effect):
-    """A joint that gives way under the payload alone, as a bracket that only the load rests on.
+    """A joint that gives way only under the payload, such as a bracket that carries only the payload.
 
     d_theta = c (torque with `payload_kg` - torque without payload), in the deflected posture.
 
@@ -125,7 +125,7 @@ class PayloadChange(Effect):
 
 @dataclass(frozen=True)
 class LeakDown(Effect):
-    """A cylinder that leaks while it stands: its joint sinks below its encoder by a rate times the dwell.
+    """A cylinder that leaks at standstill: its joint sinks below the encoder's reading by a rate times the dwell.
 
     d_theta = -rate * time since the last motion (column `dwell_s`).
     """

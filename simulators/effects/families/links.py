@@ -14,12 +14,12 @@ from simulators.effects.base import Bend, Body, BoomEffect, Effect, Floats, boom
 
 @dataclass(frozen=True)
 class BoomDroop(BoomEffect):
-    """A boom that bends: a cantilever from its root to its tip, longer as it extends.
+    """A boom that bends: a cantilever from its root to its tip, whose length grows as it extends.
 
     Euler-Bernoulli cantilever under tip load F, tip moment M and its own weight W spread over length L.
 
     deflection = (F L^3 / 3 + M L^2 / 2 + W L^3 / 8) / EI,  slope = (F L^2 / 2 + M L + W L^2 / 6) / EI,
-    F and M across the boom's axis, in the bent posture.
+    with F and M perpendicular to the boom's axis, in the bent posture.
 
     Attributes:
         flexibility_per_Nm2: 1 / EI; 4e-9 is about 20 mm at full reach of a 7 m boom with 2.8 t at its tip.
@@ -47,12 +47,12 @@ class BoomDroop(BoomEffect):
 
 @dataclass(frozen=True)
 class PadPlay(BoomEffect):
-    """Worn slide pads: the inner section of the boom tilts in the outer one to the side that its load asks for.
+    """Worn slide pads: the inner section of the boom tilts in the outer section to the side of its load.
 
     Tilt clearance / overlap about the level axis across the boom, at the mouth of the outer section.
 
-    The overlap is the stroke's upper limit + 0.4 strokes - the extension; the side is that of the moment at the mouth.
-    Everything from the boom's tip on moves.
+    The overlap is the stroke's upper limit + 0.4 strokes - the extension. The sign of the tilt is the sign of the
+    moment at the mouth. Everything from the boom's tip on moves.
     """
 
     amplitudes: ClassVar[Mapping[str, float]] = {"clearance_mm": 8.0}
@@ -67,7 +67,7 @@ class PadPlay(BoomEffect):
         mouth = beam.tip_mm - (1e3 * beam.length_m - outer_mm)[:, None] * beam.axis
         moment = beam.moment_newton_m + np.cross((beam.tip_mm - mouth) / 1e3, beam.force_newton)
         level = np.cross(beam.axis, body.gravity)
-        level = level / np.maximum(np.linalg.norm(level, axis=1), 1e-12)[:, None]  # a boom on end has none
+        level = level / np.maximum(np.linalg.norm(level, axis=1), 1e-12)[:, None]  # a vertical boom has none
         side = np.sign(np.sum(moment * level, axis=1))
         tilt = (side * self.clearance_mm / overlap_mm)[:, None] * level
         return (Bend(row, mouth, tilt, np.zeros_like(tilt)),)
@@ -75,13 +75,13 @@ class PadPlay(BoomEffect):
 
 @dataclass(frozen=True)
 class LateralCompliance(Effect):
-    """A link that tilts in its bearing: what pulls it sideways turns it out of its joint's plane.
+    """A link that tilts in its bearing: a sideways load turns it out of its joint's plane.
 
-    A joint's link, and all beyond, turns by compliance times the part of the weights' moment across its axis.
+    A joint's link, and everything beyond, turns by compliance times the weights' moment perpendicular to its axis.
 
     Attributes:
-        where: a revolute joint, not the first that turns.
-        compliance_rad_per_Nm: the same about both axes across the joint's.
+        where: a revolute joint, but not the first one that turns.
+        compliance_rad_per_Nm: the same about both axes perpendicular to the joint's axis.
     """
 
     amplitudes: ClassVar[Mapping[str, float]] = {"compliance_rad_per_Nm": 20e-3}
@@ -94,7 +94,7 @@ class LateralCompliance(Effect):
         turned = {number for number, what, _, _ in rig.couplings() if what == "theta"}
         row = first_turned(rig).get(self.where)
         if not rig.masses or row is None or not turned & set(rig.path(row)[:-1]):
-            raise ValueError(f"{self.family}@{self.where}: it acts at joints beyond another that turns, under weights")
+            raise ValueError(f"{self.family}@{self.where}: it can act only under weights, beyond a turning joint")
 
     def moment_row(self, rig: Rig) -> int:
         return first_turned(rig)[self.where]
@@ -102,7 +102,7 @@ class LateralCompliance(Effect):
     def bends(self, body: Body) -> Sequence[Bend]:
         row = self.moment_row(body.rig)
         turning = body.turning(row)
-        # z x (M x z) is M without its part along z.
+        # z x (M x z) is M without its part along z
         across = np.cross(turning.axis, np.cross(turning.moment_newton_m, turning.axis))
         tilt = self.compliance_rad_per_Nm * across
         return (Bend(row, turning.straight_mm, tilt, np.zeros_like(tilt)),)
@@ -110,13 +110,13 @@ class LateralCompliance(Effect):
 
 @dataclass(frozen=True)
 class PassiveCompliance(Effect):
-    """A coupled row that gives way: the far link of a parallel linkage turns further under its load.
+    """A coupled row that gives way: the far link of a parallel linkage turns farther under its load.
 
-    A row turns further by compliance times the moment about its axis of all weights that it carries.
+    A row turns farther by compliance times the moment about its axis of all weights that it carries.
 
     Attributes:
-        where: `row` and its number; a row that turns and is not the first that a revolute joint turns.
-        compliance_rad_per_Nm: of the linkage.
+        where: `row` and its number; the row must turn and must not be the first row that a revolute joint turns.
+        compliance_rad_per_Nm: compliance of the linkage.
     """
 
     amplitudes: ClassVar[Mapping[str, float]] = {"compliance_rad_per_Nm": 20e-3}
@@ -128,7 +128,7 @@ class PassiveCompliance(Effect):
         passive = sorted(turned - set(first_turned(rig).values()))
         if not rig.masses or self.where not in [f"row{number}" for number in passive]:
             there = ", ".join(f"row{number}" for number in passive if rig.masses) or "no row"
-            raise ValueError(f"{self.family}@{self.where}: under weights it acts at {there} of rig {rig.name!r}")
+            raise ValueError(f"{self.family}@{self.where}: it can act under weights at {there} of rig {rig.name!r}")
 
     def moment_row(self, rig: Rig) -> int:
         del rig
@@ -142,9 +142,9 @@ class PassiveCompliance(Effect):
 
 @dataclass(frozen=True)
 class LinkageCoupling(Effect):
-    """A parallel linkage that is no parallelogram: the rows that a joint drives turn by different angles.
+    """A parallel linkage that is not a parallelogram: the rows that a joint drives turn by different angles.
 
-    All rows that the joint turns, but for the first, turn by (1 + k) times their nominal angle.
+    All rows that the joint turns, except the first, turn by (1 + k) times their nominal angle.
 
     Attributes:
         where: the driving joint.
@@ -158,7 +158,7 @@ class LinkageCoupling(Effect):
     def check(self, rig: Rig) -> None:
         super().check(rig)
         if not self._rows(rig):
-            raise ValueError(f"{self.family}@{self.where}: {self.where} turns no second row of rig {rig.name!r}")
+            raise ValueError(f"{self.family}@{self.where}: {self.where} does not turn a second row of rig {rig.name!r}")
 
     def _rows(self, rig: Rig) -> Mapping[int, float]:
         driven = {n: share for n, what, joint, share in rig.couplings() if joint == self.where and what == "theta"}
@@ -171,13 +171,13 @@ class LinkageCoupling(Effect):
 
 @dataclass(frozen=True)
 class ThermalExpansion(Effect):
-    """Steel that grows with its temperature: every length of the machine by the same share.
+    """Steel that expands with its temperature: every length of the machine by the same share.
 
-    All lengths x (1 + alpha (T - T0)), T of the column `temperature_degC`; the base's origin stays.
+    All lengths x (1 + alpha (T - T0)), T the column `temperature_degC`; the base's origin does not move.
 
     Attributes:
         per_K: alpha; 12e-6 for steel.
-        at_degC: T0; None: the mean of the rows given.
+        at_degC: T0; None for the mean of the given rows.
     """
 
     amplitudes: ClassVar[Mapping[str, float]] = {"per_K": 2.5e-5}
@@ -195,16 +195,16 @@ _LEAST_LINK_MM = 500.0
 
 @dataclass(frozen=True)
 class SolarBow(Effect):
-    """A link that the sun warms from above: it bows away from the sun, the more the flatter it lies.
+    """A link that the sun warms from above: it bows away from the sun, most if it is level.
 
-    d_theta = k (T - T0) cos(elevation of the link that the joint moves), T of the column `temperature_degC`.
+    d_theta = k (T - T0) cos(elevation of the link that the joint moves), T the column `temperature_degC`.
 
-    The link runs from the frame whose origin is on the joint's axis to the next along the machine that is half a metre
-    away or more.
+    The link runs from the frame whose origin is on the joint's axis to the next frame along the machine that is at
+    least half a metre away.
 
     Attributes:
         rad_per_K: k.
-        at_degC: T0; None: the mean of the rows given.
+        at_degC: T0; None for the mean of the given rows.
     """
 
     amplitudes: ClassVar[Mapping[str, float]] = {"rad_per_K": 5e-4}
@@ -221,7 +221,7 @@ class SolarBow(Effect):
         rig = body.rig
         row = next(n for n, driven, joint, _ in rig.couplings() if joint == self.where and driven == "theta")
         axis_frame = row
-        if rig.convention == "dh":  # a row turns about the axis of the one before
+        if rig.convention == "dh":  # a row turns about the axis of the previous row
             axis_frame = (0, *rig.path(row)[:-1])[-1]
         root = body.origin_mm(axis_frame)
         up = -body.gravity / np.linalg.norm(body.gravity)

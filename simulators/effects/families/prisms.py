@@ -1,4 +1,4 @@
-"""Errors of a prism: its constant, the side that it shows, its seat."""
+"""Errors of a prism: constant, angle of incidence, seat."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from simulators.effects.base import DrawContext, Effect, Floats, Sight, step_tim
 
 @dataclass(frozen=True)
 class PrismConstant(Effect):
-    """A prism whose constant is set wrong: every distance to it is off by the same length.
+    """A prism whose constant is set wrong: every distance to it is wrong by the same length.
 
-    A fix is `mm` further from the station than the prism, along the line of sight.
+    A fix is `mm` farther from the station than the prism, along the line of sight.
 
-    At `station` it concerns all prisms, else the prism of that name.
+    At `station` the effect applies to all prisms, else to the named prism.
     """
 
     amplitudes: ClassVar[Mapping[str, float]] = {"mm": 40.0}
@@ -36,11 +36,11 @@ class PrismConstant(Effect):
 
 @dataclass(frozen=True)
 class PrismIncidence(Effect):
-    """A 360 degree prism that reads long or short by the side that it shows to the station.
+    """A 360 degree prism whose distances are too long or too short, depending on the side that faces the station.
 
     Distance error cos1 cos(psi) + sin1 sin(psi), psi the azimuth of the direction to the station.
 
-    psi is about the z axis of the frame that the prism is fixed to, from its x axis.
+    psi is measured about the z axis of the frame to which the prism is fixed, from its x axis.
     """
 
     amplitudes: ClassVar[Mapping[str, float]] = {"cos1_mm": 8.0, "sin1_mm": 8.0}
@@ -62,9 +62,9 @@ class PrismIncidence(Effect):
 
 @dataclass(frozen=True)
 class PrismSeatStep(Effect):
-    """A prism that sits otherwise in its seat from one instant on.
+    """A prism whose position in its seat changes at one instant.
 
-    After `time_s` (column `time_s`) the prism is off by a vector along the axes of the frame that it is fixed to.
+    After `time_s` (column `time_s`) the prism is displaced by a vector in the frame to which it is fixed.
     """
 
     amplitudes: ClassVar[Mapping[str, float]] = {"x_mm": 30.0, "y_mm": 30.0, "z_mm": 30.0}

@@ -13,9 +13,9 @@ from simulators.effects.base import Body, Effect, Floats, Sight, hours_since
 
 @dataclass(frozen=True)
 class StationScale(Effect):
-    """A distance meter with the wrong atmospheric correction: every distance is off by the same share.
+    """A distance meter with the wrong atmospheric correction: every distance is wrong by the same share.
 
-    A fix is at (1 + k) times the prism's place, seen from the instrument's centre.
+    A fix is at (1 + k) times the prism's position relative to the instrument's centre.
 
     Attributes:
         ppm: k * 1e6.
@@ -33,9 +33,9 @@ class StationScale(Effect):
 
 @dataclass(frozen=True)
 class Latency(Effect):
-    """A fix that comes late: stamped t, it shows the machine at t - latency.
+    """A late fix: with stamp t, it shows the machine at t - latency.
 
-    The machine at the fix is at readings - rate * latency, the rate of the columns `<joint>_rate`.
+    At the fix the joints are at readings - rate * latency, with the rates from the columns `<joint>_rate`.
     """
 
     amplitudes: ClassVar[Mapping[str, float]] = {"seconds": 0.3}
@@ -49,13 +49,13 @@ class Latency(Effect):
 
 @dataclass(frozen=True)
 class ClockDrift(Effect):
-    """Two clocks that run apart: fixes come the later the longer the data goes on.
+    """Two clocks with different rates: the latency of the fixes grows over the data.
 
     A latency of ppm * 1e-6 * the time since the first row (columns `time_s` and `<joint>_rate`).
 
     Attributes:
         ppm: rate by which the station's clock is slow.
-        first_s: the instant at which the clocks agree; None: the earliest of the rows given.
+        first_s: time at which the clocks agree; None for the earliest time of the given rows.
     """
 
     amplitudes: ClassVar[Mapping[str, float]] = {"ppm": 50.0}

@@ -1,4 +1,4 @@
-"""Errors of length transducers and the cylinders that they sit on."""
+"""Errors of length transducers and of the cylinders on which they are mounted."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from simulators.effects.base import Body, DrawContext, Effect, Floats, step_time
 
 @dataclass(frozen=True)
 class TransducerScale(Effect):
-    """A length transducer whose scale is off.
+    """A length transducer with a wrong scale.
 
     d_L = scale * L as read; 2e-3 is 4 mm at the end of a 2 m stroke.
     """
@@ -29,7 +29,7 @@ class TransducerScale(Effect):
 
 @dataclass(frozen=True)
 class TransducerQuadratic(Effect):
-    """A length transducer that is not linear: right in the middle of its stroke, off at both ends.
+    """A length transducer that is not linear: right in the middle of its stroke, wrong at both ends.
 
     d_L = k (L - mid-stroke)^2, L as read in m.
 
@@ -50,9 +50,9 @@ class TransducerQuadratic(Effect):
 
 @dataclass(frozen=True)
 class TransducerIndexJump(Effect):
-    """A length transducer that loses its index: from one instant on it is off by a constant.
+    """A length transducer that loses its index: from one instant on it is wrong by a constant.
 
-    d_L = jump for every instant after `time_s` (column `time_s`).
+    d_L = jump at all times after `time_s` (column `time_s`).
     """
 
     amplitudes: ClassVar[Mapping[str, float]] = {"jump_mm": 30.0}
@@ -70,11 +70,11 @@ class TransducerIndexJump(Effect):
 
 @dataclass(frozen=True)
 class TransducerCumulative(Effect):
-    """A length transducer on a wire or wheel that slips a little with every metre it travels.
+    """A length transducer on a wire or wheel that slips a little with every metre of travel.
 
     d_L = k * path travelled, in m, since the first row.
 
-    The path is the column `<joint>_travel_m` where the caller has it, else that of the readings from row to row.
+    The path is the column `<joint>_travel_m` if the caller provides it, else the sum of the changes from row to row.
 
     Attributes:
         mm_per_m: k.
@@ -96,9 +96,9 @@ class TransducerCumulative(Effect):
 
 @dataclass(frozen=True)
 class CylinderCompression(Effect):
-    """A cylinder that its oil pressure makes longer than its transducer says.
+    """A cylinder that its oil pressure makes longer than its transducer reads.
 
-    d_s = k p, p of the column `<joint>_bar`.
+    d_s = k p, p the column `<joint>_bar`.
 
     Attributes:
         mm_per_bar: k.

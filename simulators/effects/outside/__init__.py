@@ -1,1 +1,1 @@
-"""Effects that no library names, in whatever form: a search for missing effects must not misname them."""
+"""Effects that are in no library in any form: a search for missing effects must not give them a wrong name."""

@@ -1,4 +1,4 @@
-"""Errors of joints that no library names, in whatever form."""
+"""Errors of joints that are in no library in any form."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from simulators.hydraulics import DEAD_BAND_MA, RATED_BAR, VALVE_JOINTS
 
 @dataclass(frozen=True)
 class Creep(Effect):
-    """A joint that goes on giving way under its load, quickly at first: hoses, seals and rubber.
+    """A joint that keeps yielding under its load, quickly at first: hoses, seals and rubber.
 
-    d_theta = c torque log(1 + dwell / tau), dwell of the column `dwell_s`, the torque that of the deflected posture.
+    d_theta = c torque log(1 + dwell / tau), dwell the column `dwell_s`, with the torque in the deflected posture.
 
     Attributes:
         rad_per_Nm: c.
@@ -39,9 +39,9 @@ class Creep(Effect):
 
 @dataclass(frozen=True)
 class StickSlipRate(Effect):
-    """A joint that is dragged back while it moves, at once and by much the same whatever its speed.
+    """A joint that is dragged back while it moves, by nearly the same angle at any speed.
 
-    d_theta = e tanh(rate / v), the rate of the column `<joint>_rate`; nothing at rest.
+    d_theta = e tanh(rate / v), rate the column `<joint>_rate`; zero at rest.
 
     Attributes:
         rad: e.
@@ -61,13 +61,13 @@ class StickSlipRate(Effect):
 
 @dataclass(frozen=True)
 class ThermalCross(Effect):
-    """A telescope that jams in the warmth: its joint errs with temperature times extension.
+    """A telescope that jams when warm: its joint has an error proportional to temperature times extension.
 
-    d_theta = e (T - T0) / 10 K * L / upper limit, T of the column `temperature_degC`, L the stroke as read.
+    d_theta = e (T - T0) / 10 K * L / upper limit, T the column `temperature_degC`, L the stroke as read.
 
     Attributes:
         rad_at_10K: e.
-        at_degC: T0; None: the mean of the rows given.
+        at_degC: T0; None for the mean of the given rows.
     """
 
     amplitudes: ClassVar[Mapping[str, float]] = {"rad_at_10K": 6e-3}
@@ -89,9 +89,9 @@ class ThermalCross(Effect):
 
 @dataclass(frozen=True)
 class CrossLaw(Effect):
-    """A hose or linkage that one joint drags along another: no law of either alone.
+    """A hose or linkage that one joint drags along another: the law depends on both joints.
 
-    d_theta = e sin(3 phi) (L / mid-stroke - 1), as read: phi the revolute joint before this one, L the stroke.
+    d_theta = e sin(3 phi) (L / mid-stroke - 1), with readings phi of the previous revolute joint and L of the stroke.
     """
 
     amplitudes: ClassVar[Mapping[str, float]] = {"rad": 6e-3}
@@ -120,21 +120,21 @@ class CrossLaw(Effect):
 
 @dataclass(frozen=True)
 class ValveCurrentError(Effect):
-    """Oil pressure in a moving actuator winds up its mounting, beyond the encoder's reach.
+    """Oil pressure in a moving actuator winds up its mounting, which the encoder does not measure.
 
     d_theta = e * sign(i) * s^2 / (1 + s^2) * pump_bar / 200 bar, with s = (|i| - dead band) / knee, never below 0.
 
-    Opening the spool meters oil into the chamber that pushes. What leaks past the piston seals grows with the pressure
-    drop, so the drop settles where leakage and seal friction take up the metered flow: small at first, as a spool's
-    fine-control notches open with the square of its stroke, and in the end the pump's pressure itself. That force
-    bends cylinder pins and brackets that lie between the encoder and the link. The joint's true value is therefore off
-    by an amount that the valve's current and the pump's pressure tell and the encoder does not see.
+    Opening the spool meters oil into the chamber that pushes. Leakage past the piston seals grows with the pressure
+    drop, so the drop settles where leakage and seal friction balance the metered flow. It is small at first, because a
+    spool's fine-control notches open with the square of its stroke, and finally reaches the pump's pressure. This force
+    bends cylinder pins and brackets between the encoder and the link. The joint's true value is therefore wrong by an
+    amount that depends on the valve's current and the pump's pressure, and that the encoder does not measure.
 
     Needs the columns `<valve>_valve_mA` of the joint's valve and `pump_bar`.
 
     Attributes:
-        rad_at_rated: e, far above the knee at rated pressure.
-        knee_mA: current past the dead band where half of it is reached.
+        rad_at_rated: e, the error far above the knee at rated pressure.
+        knee_mA: current above the dead band at which half of e is reached.
     """
 
     amplitudes: ClassVar[Mapping[str, float]] = {"rad_at_rated": 6e-3}
@@ -148,7 +148,7 @@ class ValveCurrentError(Effect):
         super().check(rig)
         if self._valve() is None:
             known = ", ".join(VALVE_JOINTS.values())
-            raise ValueError(f"{self.family}@{self.where}: no valve's current is measured there; known: {known}")
+            raise ValueError(f"{self.family}@{self.where}: no valve current is measured there; known: {known}")
 
     def _valve(self) -> str | None:
         return next((valve for valve, joint in VALVE_JOINTS.items() if joint == self.where), None)

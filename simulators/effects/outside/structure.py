@@ -1,4 +1,4 @@
-"""Structure that bends as no library has it: boom, carrier and a prism's mast."""
+"""Structural deformations that are in no library: boom, carrier and a prism's mast."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from simulators.effects.base import Bend, Body, BoomEffect, Effect, Floats, Sigh
 
 @dataclass(frozen=True)
 class TwistByReach(BoomEffect):
-    """A boom that twists: what hangs beside its axis turns its tip, the more the longer it is.
+    """A boom that twists: an eccentric load rotates its tip, more so the longer the boom is.
 
-    Twist = moment about the boom's axis * length / (G J); everything from the boom's tip on turns.
+    Twist = moment about the boom's axis * length / (G J); everything from the boom's tip on rotates.
 
     Attributes:
-        flexibility_per_Nm2: 1 / (G J), of the torsional stiffness.
+        flexibility_per_Nm2: 1 / (G J), the inverse of the torsional stiffness.
     """
 
     amplitudes: ClassVar[Mapping[str, float]] = {"flexibility_per_Nm2": 100.0}
@@ -35,7 +35,7 @@ class TwistByReach(BoomEffect):
 
 @dataclass(frozen=True)
 class BaseRocking(Effect):
-    """A carrier that rocks on its jacks: it leans to the side that the boom weighs on.
+    """A carrier that rocks on its jacks: it leans to the side that the boom loads.
 
     Tilt about the base's origin by c times the level moment of all weights about it.
 
@@ -61,11 +61,11 @@ class BaseRocking(Effect):
 
 @dataclass(frozen=True)
 class PrismMastBend(Effect):
-    """A prism on a slender mast: it hangs to the side that gravity pulls it to, as the frame under it turns.
+    """A prism on a slender mast: gravity bends the mast to one side as the frame under it turns.
 
-    The prism lies off by k times the part of gravity's direction that is across its mast.
+    The prism is displaced by k times the part of gravity's direction that is perpendicular to its mast.
 
-    The mast is along the z axis of the frame that the prism is fixed to.
+    The mast is along the z axis of the frame to which the prism is fixed.
 
     Attributes:
         mm: k, for a level mast.

@@ -324,8 +324,8 @@ def test_further_poses_are_measured_of_the_same_machine(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("option", "value", "said"),
     [
-        ("--effects", "rust", "rust: known are joint_compliance"),
-        ("--first", "999000", "run into those to report"),  # seeds to tune on and seeds to report never meet
+        ("--effects", "rust", "rust: unknown; known: joint_compliance"),
+        ("--first", "999000", "reach the reported seeds"),  # seeds to tune on and seeds to report never meet
     ],
 )
 def test_cases_that_there_are_not_are_refused(option: str, value: str, said: str) -> None:

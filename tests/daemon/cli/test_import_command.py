@@ -233,7 +233,7 @@ def test_records_that_are_passed_over_are_said_with_a_map_as_well(tmp_path: Path
     survey.write_text(SDR_HEAD + sdr("08KI", "1", 7.5, 1.2, 0.3) + sdr("08TP", "1", 1.0, 2.0, 3.0))
     found = told(survey, "--out", tmp_path / "1.csv")
     again = told(survey, "--map", found["map_file"], "--out", tmp_path / "2.csv")
-    said = "job.sdr has 1 record 08KI, from line 3 on: coordinates typed in, not measured; passed over"
+    said = "job.sdr has 1 record 08KI, from line 3 on: coordinates typed in, not measured; skipped"
     assert (found["points"], again["points"], said in found["notes"], said in again["notes"]) == (1, 1, True, True)
 
 

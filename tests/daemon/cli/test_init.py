@@ -73,7 +73,7 @@ def test_an_slcan_adapter_is_at_a_serial_port(tmp_path: Path) -> None:
         *("--interface", "slcan", "--channel", "can0"),
     )
     assert refused.exit_code == 2
-    assert "needs the interface socketcan" in refused.stderr
+    assert "use the interface socketcan" in refused.stderr
 
 
 @pytest.mark.parametrize("joint", ["theta1", "theta1:round:0:1", "theta1:revolute:a:b", "t:revolute:0:1:2:3"])

@@ -89,7 +89,7 @@ def test_every_wrong_key_is_told_at_once(tmp_path: Path) -> None:
 @pytest.mark.parametrize("channel", ["/dev/ttyACM0", "", "..", "can 0", "a-name-longer-than-15"])
 def test_a_socketcan_channel_that_no_interface_can_have_is_refused(tmp_path: Path, channel: str) -> None:
     message = check(f'rig = "swdt82"\n[[can]]\nchannel = "{channel}"\n', tmp_path)
-    assert "is no name of a network interface" in message
+    assert "is not the name of a network interface" in message
     assert "slcan" in message
 
 
@@ -115,8 +115,8 @@ def test_a_number_that_no_clock_disk_or_generator_takes_is_refused(tmp_path: Pat
     [
         ("[store]\nfree_gb = true", "store.free_gb: cannot be true or false, found true"),
         ("[sessions]\nfixes_per_shot = false", "sessions.fixes_per_shot: cannot be true or false, found false"),
-        ('[store]\nbackup_directory = ""', "store.backup_directory: is empty; give a path, or leave the key out"),
-        ('state_directory = ""', "state_directory: is empty; give a path, or leave the key out"),
+        ('[store]\nbackup_directory = ""', "store.backup_directory: is empty; give a path, or remove the key"),
+        ('state_directory = ""', "state_directory: is empty; give a path, or remove the key"),
         ('[[station]]\nserial.path = "/dev/x"\nmax_range_m = true', "max_range_m: cannot be true or false, found true"),
         ('[[station]]\nserial = { path = "/dev/x", baud = true }', "serial.baud: cannot be true or false, found true"),
     ],
@@ -179,15 +179,18 @@ def test_no_message_speaks_of_python(tmp_path: Path, section: str, model: type[B
 @pytest.mark.parametrize(
     ("options", "told"),
     [
-        ('channel = "239.74.163.9"', "channel has a key of its own: give it beside `options`, not in them"),
-        ('interface = "slcan"', "interface has a key of its own"),
-        ("bitrate = 500000", "bitrate has a key of its own"),
-        ("allow_transmit = true", "allow_transmit has a key of its own"),
-        ("listen_only = false", "listen_only is no option: `allow_transmit` says it; remove it"),
-        ('bustype = "slcan"', "bustype is no option: `interface` says it; remove it"),
-        ("ignore_config = false", "ignore_config is no option: no configuration of python-can is read beside this one"),
-        ('config_context = "x"', "config_context is no option"),
-        ("port = [1]", "port must be a text in quotes, a number, true or false"),
+        ('channel = "239.74.163.9"', "channel is a key of the link: set it in the link itself, not in `options`"),
+        ('interface = "slcan"', "interface is a key of the link"),
+        ("bitrate = 500000", "bitrate is a key of the link"),
+        ("allow_transmit = true", "allow_transmit is a key of the link"),
+        ("listen_only = false", "listen_only cannot be given as an option: `allow_transmit` sets it; remove it"),
+        ('bustype = "slcan"', "bustype cannot be given as an option: `interface` sets it; remove it"),
+        (
+            "ignore_config = false",
+            "ignore_config cannot be given as an option: rigcal does not read python-can's configuration files",
+        ),
+        ('config_context = "x"', "config_context cannot be given as an option"),
+        ("port = [1]", "port must be a string in quotes, a number, true or false"),
     ],
 )
 def test_an_option_does_not_repeat_what_has_a_key_of_its_own(tmp_path: Path, options: str, told: str) -> None:
@@ -245,7 +248,7 @@ def test_what_is_wrong_with_a_whole_table_is_told_without_the_table(tmp_path: Pa
     text = 'rig = "swdt82"\n[[station]]\nnew_target_after_s = 20\nserial.path = "/dev/x"\n'
     with pytest.raises(ConfigError) as raised:
         parse_config(text, tmp_path / "rigcal.toml")
-    assert "station.1: new_target_after_s is gone, remove it" in str(raised.value)
+    assert "station.1: new_target_after_s no longer exists, remove it" in str(raised.value)
     assert "found" not in str(raised.value)
 
 
@@ -282,5 +285,7 @@ serial.path = "{tmp_path}/{station}"
 @pytest.mark.parametrize("channel", ["/dev/ttyUSB0@fast", "/dev/a@b@115200", "/dev/ttyUSB0@", "/dev/"])
 def test_a_serial_port_of_can_that_could_not_be_opened_is_refused(channel: str) -> None:
     text = f'rig = "swdt82"\n[[can]]\ninterface = "slcan"\nchannel = "{channel}"\n'
-    with pytest.raises(ConfigError, match="is no serial port: after the name of one comes nothing, or its rate"):
+    with pytest.raises(
+        ConfigError, match="is not a valid serial port; write its path, optionally followed by @ and its baud rate"
+    ):
         parse_config(text, Path("rigcal.toml"))

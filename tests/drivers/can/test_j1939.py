@@ -43,5 +43,5 @@ def test_no_bit_of_an_identifier_is_lost(arbitration_id: int) -> None:
 
 @pytest.mark.parametrize("arbitration_id", [-1, EXTENDED_ID_MAX + 1, 2365468705])
 def test_what_has_more_than_29_bits_is_refused(arbitration_id: int) -> None:
-    with pytest.raises(ValueError, match="no identifier of 29 bits"):
+    with pytest.raises(ValueError, match="not a 29-bit identifier"):
         J1939Id.parse(arbitration_id)

@@ -37,7 +37,7 @@ def test_twos_complement() -> None:
     "field", [(60, 8, "intel"), (0, 65, "intel"), (-1, 8, "intel"), (0, 0, "intel"), (56, 2, "motorola")]
 )
 def test_a_field_outside_the_frame_is_refused(field: tuple[int, int, str]) -> None:
-    with pytest.raises(ValueError, match="do not lie in a frame of 8 bytes"):
+    with pytest.raises(ValueError, match="do not fit in a frame of 8 bytes"):
         BitField(*field)
 
 

@@ -355,8 +355,8 @@ def _late_frame_is_marked(heard: Heard, clock: StoppedClock, send: object) -> No
     assert heard.received[0].data == b"\x01"
     assert not heard.received[0].stamp.is_doubtful
     assert told.text == (
-        f"boom: {len(marked)} frames are stored, but marked, as their time is doubtful: nobody read for a while: "
-        "rigcal was stopped, or the computer too busy"
+        f"boom: {len(marked)} frames are stored but not used for calibration, as their time is doubtful: "
+        "the port was not read for a while, because rigcal was stopped or the computer was too busy"
     )
     assert told.code == len(marked)
     assert heard.events(EventKind.FRAMES_DROPPED) == []

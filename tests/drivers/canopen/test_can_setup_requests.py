@@ -37,7 +37,9 @@ BOTH = {"allow_transmit": True, "transmit_nodes": (32, 33), "setups": [setup(), 
 def test_a_request_before_the_link_is_open_fails_and_is_not_kept_for_later() -> None:
     channel = unused_channel()
     link = virtual_link(channel, **BOTH)
-    with pytest.raises(DeviceError, match=r"^boom: nothing can be set up: the link is not open; ask again when it is"):
+    with pytest.raises(
+        DeviceError, match=r"^boom: nodes cannot be set up while the link is not open; try again when it is"
+    ):
         link.request_setup()
     with virtual_bus(channel) as bus, running(link) as heard:
         heard.wait_for(EventKind.LINK_UP)
@@ -85,9 +87,9 @@ def test_an_unfinished_set_up_ends_with_the_link_and_is_not_taken_up_again(adapt
     first, second = heard.events(EventKind.ALARM)
     assert (first.device, second.device) == ("theta1", "theta3")
     assert first.text == (
-        "node 32: set-up was cut short and may be half done because the link was lost; ask for it again"
+        "node 32: set-up was interrupted and may be incomplete because the link was lost; request it again"
     )
-    assert second.text == "node 33: set-up was not begun because the link was lost; ask for it again"
+    assert second.text == "node 33: set-up was not started because the link was lost; request it again"
     assert len(heard.sent) == sent
 
 
@@ -115,7 +117,7 @@ def test_a_check_raises_what_a_request_would_and_asks_for_nothing() -> None:
     with pytest.raises(TransmitForbiddenError, match="node 33 is not listed"):
         one_listed.check_setup()
     link = virtual_link(unused_channel(), **BOTH)
-    with pytest.raises(DeviceError, match="no channel of the rig file is on node 34"):
+    with pytest.raises(DeviceError, match="the rig file has no channel on node 34"):
         link.check_setup([32, 34])
     with running(link) as heard:
         heard.wait_for(EventKind.LINK_UP)

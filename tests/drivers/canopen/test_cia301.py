@@ -31,7 +31,7 @@ def test_every_bit_of_the_error_register_has_a_name() -> None:
 
 
 def test_an_emergency_of_other_length_is_refused() -> None:
-    with pytest.raises(ValueError, match="8 bytes, this has 3"):
+    with pytest.raises(ValueError, match="8 bytes, this one has 3"):
         decode_emergency(bytes(3))
 
 
@@ -51,7 +51,7 @@ def test_heartbeat_states(data: bytes, state: NmtState) -> None:
 
 @pytest.mark.parametrize("data", [b"", b"\x05\x00", b"\x50", b"\x60"])
 def test_a_heartbeat_that_is_none_is_refused(data: bytes) -> None:
-    with pytest.raises(ValueError, match=r"1 byte|no NMT state"):
+    with pytest.raises(ValueError, match=r"1 byte|not an NMT state"):
         decode_heartbeat(data)
 
 

@@ -82,7 +82,7 @@ def test_a_frame_that_is_too_short_is_a_failure() -> None:
 
 @pytest.mark.parametrize("words", [(REAL32,), (0x71300120,)])
 def test_a_pdo_without_the_process_value_is_refused(words: tuple[int, ...]) -> None:
-    with pytest.raises(DescriptionError, match="TPDO1 of node 60 does not carry 16 bits of object 7130h"):
+    with pytest.raises(DescriptionError, match="TPDO1 of node 60 does not contain 16 bits of object 7130h"):
         analogue(*words, process_value=0x7130)
 
 

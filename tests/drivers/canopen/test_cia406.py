@@ -99,7 +99,7 @@ def test_bytes_behind_the_mapped_objects_are_ignored() -> None:
 
 
 def test_a_pdo_without_position_is_refused_with_its_mapping() -> None:
-    with pytest.raises(DescriptionError, match=r"theta1: TPDO1 of node 32 does not carry object 6004h.* 60300110"):
+    with pytest.raises(DescriptionError, match=r"theta1: TPDO1 of node 32 does not contain object 6004h.* 60300110"):
         encoder(SPEED)
 
 
@@ -120,7 +120,7 @@ def test_an_alarm_is_told_once_and_voids_the_values_until_it_is_gone() -> None:
     assert not events(again)
     assert [r.value for r in again if isinstance(r, Reading)] == [None]
     after = decoder.decode(at(0.04), u32(0) + bytes(2))
-    assert [e.text for e in events(after)] == ["alarms (6503h) are gone"]
+    assert [e.text for e in events(after)] == ["alarms (6503h) have cleared"]
     assert [r.status for r in after if isinstance(r, Reading)] == [Status.OK]
 
 
@@ -129,7 +129,7 @@ def test_a_warning_is_told_and_leaves_the_value() -> None:
     records = decoder.decode(START, u32(16384) + b"\x10\x00")
     assert [e.text for e in events(records)] == ["warnings (6505h): battery charge low"]
     assert the_reading(records).value == 90.0
-    assert [e.text for e in events(decoder.decode(START, u32(16384) + bytes(2)))] == ["warnings (6505h) are gone"]
+    assert [e.text for e in events(decoder.decode(START, u32(16384) + bytes(2)))] == ["warnings (6505h) have cleared"]
 
 
 def test_alarm_and_warning_bits_have_the_names_of_the_profile() -> None:

@@ -128,7 +128,7 @@ def test_a_node_that_fits_is_configured_for_sync_and_started() -> None:
     assert (event.kind, event.device) == (EventKind.CONFIGURED, "theta1")
     assert event.text == (
         "theta1 (node 32): configured and started, sends at every SYNC; device type 00020196h, vendor 42h, "
-        "serial number 1234h; 65536 units per revolution, 65536 in all"
+        "serial number 1234h; 65536 units per revolution, 65536 in total"
     )
 
 
@@ -195,14 +195,14 @@ def test_what_a_node_does_not_tell_is_a_warning() -> None:
     node = Node({(0x6001, 0): None, (0x6500, 0): None, (0x1A00, 0): None, (0x1018, 4): None})
     *warnings, configured = converse(node, setup())
     assert [w.kind for w in warnings] == [EventKind.WARNING] * 2
-    assert "units per revolution (6001h): the node does not tell; expected 65536, not verified" in warnings[0].text
-    assert "mapping (1A00h): the node does not tell" in warnings[1].text
+    assert "units per revolution (6001h): the node does not report it; expected 65536, not verified" in warnings[0].text
+    assert "mapping (1A00h): the node does not report it" in warnings[1].text
     assert configured.kind is EventKind.CONFIGURED
 
 
 def test_a_node_without_6502h_is_taken_at_its_resolution() -> None:
     warnings = converse(Node({(0x6500, 0): (0, 2), (0x6502, 0): None}), setup())
-    assert "total units (6501h x 6502h, scaling off): the node does not tell" in warnings[0].text
+    assert "total units (6501h x 6502h, scaling off): the node does not report it" in warnings[0].text
 
 
 @pytest.mark.parametrize(("changes", "step"), [({(0x6005, 1): (5000, 4)}, 5000), ({(0x6501, 0): (100000, 4)}, 100000)])
@@ -311,9 +311,9 @@ def test_a_lost_link_cuts_all_set_ups_short_and_says_so() -> None:
         (
             "theta1",
             EventKind.ALARM,
-            "node 32: set-up was cut short and may be half done because the link was lost; ask for it again",
+            "node 32: set-up was interrupted and may be incomplete because the link was lost; request it again",
         ),
-        ("theta3", EventKind.ALARM, "node 33: set-up was not begun because the link was lost; ask for it again"),
+        ("theta3", EventKind.ALARM, "node 33: set-up was not started because the link was lost; request it again"),
     ]
     assert not conversation.is_active
     assert conversation.take_frames() == []
@@ -391,5 +391,5 @@ def test_a_set_up_is_refused_where_it_is_not_allowed() -> None:
     with pytest.raises(TransmitForbiddenError, match="node 32 is not listed"):
         link.request_setup()
     link = virtual_link(unused_channel(), allow_transmit=True, transmit_nodes=(33,), setups=[setup()])
-    with pytest.raises(DeviceError, match="no channel of the rig file is on node 33"):
+    with pytest.raises(DeviceError, match="the rig file has no channel on node 33"):
         link.request_setup([33])

@@ -44,7 +44,7 @@ def test_what_is_packed_is_extracted(lengths: list[int], data: st.DataObject) ->
         ((0x60040000,), "60040000h is not index"),
         ((1 << 33,), "is not index"),
         ((-1,), "is not index"),
-        ((0x60040020, 0x60040020, 0x60300110), "80 bits, a frame has 64"),
+        ((0x60040020, 0x60040020, 0x60300110), "80 bits; a frame has 64"),
     ],
 )
 def test_a_mapping_that_no_pdo_can_have_is_refused(words: tuple[int, ...], reason: str) -> None:

@@ -44,7 +44,7 @@ def test_a_node_that_is_not_listed_gets_nothing(frame: str) -> None:
     ],
 )
 def test_some_frames_are_never_sent(frame: Frame) -> None:
-    with pytest.raises(TransmitForbiddenError, match="none that rigcal may ever send"):
+    with pytest.raises(TransmitForbiddenError, match="of a kind that rigcal never sends"):
         TransmitPermission("boom", True, range(128)).check(frame)
 
 

@@ -92,8 +92,10 @@ def test_numbers_are_read_in_the_base_of_the_header(tmp_path: Path) -> None:
     (frame,) = read(tmp_path, DATE + "base dec  timestamps absolute\n0.1 1  416  Rx  d 3 255 7 012\n")
     assert (frame.arbitration_id, frame.data) == (416, bytes([255, 7, 12]))
     text = refused(tmp_path, DATE + "base dec  timestamps absolute\n0.1 1  1A0  Rx  d 1 0\n")
-    assert text == "boom.asc:3: identifier '1A0' is no decimal number: '0.1 1  1A0  Rx  d 1 0'"
-    assert "says 1 bytes and has 0" in refused(tmp_path, DATE + "base dec\n0.1 1  416  Rx  d 1 256\n")
+    assert text == "boom.asc:3: identifier '1A0' is not a decimal number: '0.1 1  1A0  Rx  d 1 0'"
+    assert "has 0 bytes, but its length is given as 1" in refused(
+        tmp_path, DATE + "base dec\n0.1 1  416  Rx  d 1 256\n"
+    )
 
 
 @pytest.mark.parametrize(
@@ -142,15 +144,15 @@ def test_the_first_line_after_a_short_header_is_a_frame_as_well(tmp_path: Path) 
 
 def test_a_log_whose_header_is_missing_is_refused_as_its_times_and_numbers_would_be_guessed(tmp_path: Path) -> None:
     for text in (FRAME, DATE + FRAME):
-        assert "a frame without a line 'base hex' or 'base dec' before it" in refused(tmp_path, text)
+        assert "there is no line 'base hex' or 'base dec' before this frame" in refused(tmp_path, text)
     text = refused(tmp_path, BASE + FRAME)
-    assert text.startswith("boom.asc:2: a frame without a line 'date ...' or 'Begin Triggerblock ...' before it")
+    assert text.startswith("boom.asc:2: there is no line 'date ...' or 'Begin Triggerblock ...' before this frame")
     assert "'date ...'" in refused(tmp_path, BASE + "0.1 1  ErrorFrame\n")
 
 
 def test_times_that_count_from_line_to_line_are_refused(tmp_path: Path) -> None:
     text = refused(tmp_path, DATE + "base hex  timestamps relative\n" + FRAME)
-    assert text == "boom.asc:2: times that count from the line before are not read: save the log with absolute ones"
+    assert text == "boom.asc:2: relative timestamps are not supported; save the log with absolute timestamps"
 
 
 @pytest.mark.parametrize(
@@ -180,16 +182,16 @@ def test_a_line_that_is_no_frame_and_not_known_is_refused(tmp_path: Path, line: 
 @pytest.mark.parametrize(
     ("line", "reason"),
     [
-        ("0.010000 1  1G0             Rx   d 1 4E", "identifier '1G0' is no hexadecimal number: '0.010000 1  1G0 "),
-        ("0.010000 1  1A0             Rx   d 8 4E 61", "the frame says 8 bytes and has 2: "),
-        ("0.010000 1  1A0             Rx   d 2 4E 61 00", "the frame says 2 bytes and has 3: "),
-        ("0.010000 1  1A0             Rx   d 1 XX", "the frame says 1 bytes and has 0: "),
-        ("0.010000 1  1A0             Rx   d 1 4", "the frame says 1 bytes and has 0: "),
-        ("0.010000 1  1A0             Rx   d 10 4E", "a frame has no length 10: "),
-        ("0.010000 1  1A0             Rx   d Z 4E", "length 'Z' is no hexadecimal number: "),
-        ("9" * 12 + ".0 1  1A0       Rx   d 1 00", "the frame's time lies before 1970 or after 2262"),
-        ("0.010000 1  8FF             Rx   d 1 4E", "identifier 8FFh is beyond"),
-        ("0.010000 1  2FFFFFFFx       Rx   d 1 4E", "identifier 2FFFFFFFh is beyond"),
+        ("0.010000 1  1G0             Rx   d 1 4E", "identifier '1G0' is not a hexadecimal number: '0.010000 1  1G0 "),
+        ("0.010000 1  1A0             Rx   d 8 4E 61", "the frame has 2 bytes, but its length is given as 8: "),
+        ("0.010000 1  1A0             Rx   d 2 4E 61 00", "the frame has 3 bytes, but its length is given as 2: "),
+        ("0.010000 1  1A0             Rx   d 1 XX", "the frame has 0 bytes, but its length is given as 1: "),
+        ("0.010000 1  1A0             Rx   d 1 4", "the frame has 0 bytes, but its length is given as 1: "),
+        ("0.010000 1  1A0             Rx   d 10 4E", "10 is not a valid frame length: "),
+        ("0.010000 1  1A0             Rx   d Z 4E", "length 'Z' is not a hexadecimal number: "),
+        ("9" * 12 + ".0 1  1A0       Rx   d 1 00", "the frame's time is before 1970 or after 2262"),
+        ("0.010000 1  8FF             Rx   d 1 4E", "identifier 8FFh is too large"),
+        ("0.010000 1  2FFFFFFFx       Rx   d 1 4E", "identifier 2FFFFFFFh is too large"),
         ("0.010000 CANFD 1 Rx 1A0 1 0 d 32 " + "00 " * 32 + "0 0 3000 0 0 0 0 0", "CAN FD frames are not supported"),
     ],
 )
@@ -203,7 +205,7 @@ def test_a_log_is_refused_wherever_its_last_frame_is_cut(tmp_path: Path) -> None
         assert refused(tmp_path, HEADER + FRAME + FRAME[:end]).startswith("boom.asc:5: "), FRAME[:end]
     assert len(read(tmp_path, HEADER + FRAME + FRAME[:whole])) == 2
     decimal = DATE + "base dec\n0.1 1  416  Rx  d 1 25"  # of 255?
-    assert "the last line has no end, its last number may be cut short" in refused(tmp_path, decimal)
+    assert "the last line has no line end, so its last number may be truncated" in refused(tmp_path, decimal)
 
 
 def test_frames_before_a_damaged_line_are_given(tmp_path: Path) -> None:

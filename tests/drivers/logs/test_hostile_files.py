@@ -54,13 +54,13 @@ def refused(path: Path, reason: str) -> None:
 @pytest.mark.parametrize("size", [0, 1, 15])
 def test_a_blf_object_smaller_than_its_header_is_refused_and_not_read_for_ever(tmp_path: Path, size: int) -> None:
     refused(
-        blf(tmp_path, struct.pack("<4sHHLL", b"LOBJ", 16, 9, size, 65).ljust(64, b"\0")), f"an object of {size} bytes"
+        blf(tmp_path, struct.pack("<4sHHLL", b"LOBJ", 16, 9, size, 65).ljust(64, b"\0")), f"an object has {size} bytes"
     )
-    refused(blf_with(tmp_path, struct.pack("<4sHHLL", b"LOBJ", 16, 1, size, 10)), f"an object of {size} bytes")
+    refused(blf_with(tmp_path, struct.pack("<4sHHLL", b"LOBJ", 16, 1, size, 10)), f"an object has {size} bytes")
 
 
 def test_a_blf_object_larger_than_any_is_refused_before_it_is_read(tmp_path: Path) -> None:
-    refused(blf_with(tmp_path, struct.pack("<4sHHLL", b"LOBJ", 16, 1, 2**32 - 1, 10)), "an object of 4294967295 bytes")
+    refused(blf_with(tmp_path, struct.pack("<4sHHLL", b"LOBJ", 16, 1, 2**32 - 1, 10)), "an object has 4294967295 bytes")
 
 
 def test_a_blf_container_that_unpacks_to_hundreds_of_times_its_size_is_refused(tmp_path: Path) -> None:
@@ -70,14 +70,14 @@ def test_a_blf_container_that_unpacks_to_hundreds_of_times_its_size_is_refused(t
 @pytest.mark.parametrize(
     ("rest", "reason"),
     [
-        (b"LOBX" + bytes(12), "no object where one should begin"),
+        (b"LOBX" + bytes(12), "no object found where one should begin"),
         (struct.pack("<4sHHLL", b"LOBJ", 16, 1, 60, 10), "the file ends before"),
-        (struct.pack("<4sHHLLH6xL4x", b"LOBJ", 16, 1, 32, 10, 7, 0), "compressed by method 7"),
+        (struct.pack("<4sHHLLH6xL4x", b"LOBJ", 16, 1, 32, 10, 7, 0), "unknown compression method 7"),
         (struct.pack("<4sHHLLH6xL4x", b"LOBJ", 16, 1, 36, 10, 2, 0) + b"junk", "not a valid BLF file after frame 0"),
-        (struct.pack("<4sHHLLH6xL4x", b"LOBJ", 16, 1, 34, 10, 2, 9) + zlib.compress(b"a")[:2], "is cut short"),
-        (struct.pack("<4sHHLLH", b"LOBJ", 16, 1, 18, 10, 2), "a container without a header"),
-        (struct.pack("<4sHHLL", b"LOBJ", 32, 9, 48, 1) + bytes(32), "a header of version 9"),
-        (struct.pack("<4sHHLL", b"LOBJ", 32, 1, 36, 1) + bytes(20), "a frame is cut short"),
+        (struct.pack("<4sHHLLH6xL4x", b"LOBJ", 16, 1, 34, 10, 2, 9) + zlib.compress(b"a")[:2], "is truncated"),
+        (struct.pack("<4sHHLLH", b"LOBJ", 16, 1, 18, 10, 2), "a container has no header"),
+        (struct.pack("<4sHHLL", b"LOBJ", 32, 9, 48, 1) + bytes(32), "a header of unknown version 9"),
+        (struct.pack("<4sHHLL", b"LOBJ", 32, 1, 36, 1) + bytes(20), "a frame is truncated"),
     ],
 )
 def test_a_damaged_blf_object_is_refused_with_its_place(tmp_path: Path, rest: bytes, reason: str) -> None:
@@ -205,15 +205,18 @@ def signal(name: str, mux: str = "", start: int = 0, bits: int = 8) -> str:
         (["BO_ 512 X: 8 A", signal("S", bits=10**9)], "signal 'S' does not fit"),
         (
             ["BO_ 512 X: 8 A", 'BA_DEF_ "a" INT 0 1;', 'BA_DEF_DEF_ "a" 0;', 'BA_ "a" 1e999999999;'],
-            "1e999999999 is beyond",
+            "1e999999999 is too large",
         ),
-        (["BO_ 512 X: 1785 A", *(signal(f"S{i}", start=8 * i) for i in range(400))], "describes too much"),
-        (["BO_ 512 X: 1785 A", *(signal(f"S{i}") for i in range(400)), "BO_ 512 Y: 8 A"], "describes too much"),
-        (["BO_ 512 X: 1785 A", *(signal(f"S{i}", start=-1) for i in range(400))], "describes too much"),
-        ([f"BO_ {2**31 + i} X{i}: 8 A" for i in range(10_001)], "describes too much"),
-        (["BU_: " + "A " * 10_001], "describes too much"),
-        (["A " * 400_001], "describes too much"),
-        (["A" * (3 << 20)], "cannot be read: it is larger than the 2,097,152 bytes"),
+        (["BO_ 512 X: 1785 A", *(signal(f"S{i}", start=8 * i) for i in range(400))], "too large to be read in time"),
+        (
+            ["BO_ 512 X: 1785 A", *(signal(f"S{i}") for i in range(400)), "BO_ 512 Y: 8 A"],
+            "too large to be read in time",
+        ),
+        (["BO_ 512 X: 1785 A", *(signal(f"S{i}", start=-1) for i in range(400))], "too large to be read in time"),
+        ([f"BO_ {2**31 + i} X{i}: 8 A" for i in range(10_001)], "too large to be read in time"),
+        (["BU_: " + "A " * 10_001], "too large to be read in time"),
+        (["A " * 400_001], "too large to be read in time"),
+        (["A" * (3 << 20)], "cannot be read: it is larger than the limit of 2,097,152 bytes"),
     ],
 )
 def test_a_dbc_file_that_would_take_minutes_and_gigabytes_is_refused(
@@ -254,7 +257,7 @@ def test_a_signal_that_no_number_can_hold_is_refused_by_name(tmp_path: Path, old
 def test_an_eds_file_larger_than_any_is_refused_before_it_is_parsed(tmp_path: Path) -> None:
     path = tmp_path / "device.eds"
     path.write_bytes(EDS.read_bytes() + b"\n;" + b" " * (2 << 20))
-    with pytest.raises(DescriptionError, match=r"cannot be read: it is larger than the 2,097,152 bytes"):
+    with pytest.raises(DescriptionError, match=r"cannot be read: it is larger than the limit of 2,097,152 bytes"):
         TransmitPdo.from_eds(path, 32, 1)
 
 

@@ -61,18 +61,18 @@ def test_what_is_written_is_read_again(tmp_path_factory: pytest.TempPathFactory,
 @pytest.mark.parametrize(
     ("old", "new", "line", "reason"),
     [
-        ("rigcal-serial-capture 1", "rigcal-serial-capture 2", 1, "not a captured serial link"),
+        ("rigcal-serial-capture 1", "rigcal-serial-capture 2", 1, "not a serial capture file"),
         ("baud 9600", "speed 9600", 3, "expected 'baud"),
-        ("baud 9600", "baud fast", 3, "no positive whole number"),
-        ("baud 9600", "baud 0", 3, "no positive whole number"),
+        ("baud 9600", "baud fast", 3, "not a positive whole number"),
+        ("baud 9600", "baud 0", 3, "not a positive whole number"),
         ("link station", "link ", 2, "expected 'link"),
-        ("rx 5130", "rx 513", 8, "damaged or the file is cut short"),
+        ("rx 5130", "rx 513", 8, "damaged or the file is truncated"),
         ("rx 5130", "rx", 8, "damaged"),
         ("rx 5130", "up 5130", 8, "damaged"),
         ("rx 5130", "rx 51ZZ", 8, "damaged"),
         ("1700000000.123456789", "1700000000.1", 8, "damaged"),
         ("1700000000.123456789", "-1.123456789", 8, "damaged"),
-        ("boot first\n", "", 7, "expected boot ID"),
+        ("boot first\n", "", 7, "expected a line 'boot ID'"),
     ],
 )
 def test_a_malformed_line_is_refused_with_file_and_line(
@@ -88,14 +88,14 @@ def test_a_log_is_refused_wherever_its_last_capture_is_cut(tmp_path: Path) -> No
     path = tmp_path / "log"
     for end in range(TEXT.rindex("17") + 1, len(TEXT)):
         path.write_text(TEXT[:end], encoding="utf-8")
-        with pytest.raises(DescriptionError, match=r"log, line 9: the line has no end: the file is cut short"):
+        with pytest.raises(DescriptionError, match=r"log, line 9: the line has no line end: the file is truncated"):
             list(read_serial_log(path))
 
 
 def test_an_empty_file_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "log"
     path.write_text("", encoding="utf-8")
-    with pytest.raises(DescriptionError, match=r"line 1: .*not a captured serial link"):
+    with pytest.raises(DescriptionError, match=r"line 1: .*not a serial capture file"):
         list(read_serial_log(path))
 
 

@@ -188,7 +188,7 @@ def test_an_unfinished_record_is_given_up_two_seconds_after_its_last_byte() -> N
     station = decoder()
     assert station.feed(received(TRACKING[:30], 1.0)) == []
     assert station.tick(at(2.9)) == []
-    assert failures(station.tick(at(3.1))) == [("record broken off", TRACKING[:30])]
+    assert failures(station.tick(at(3.1))) == [("incomplete record", TRACKING[:30])]
     assert failures(station.tick(at(3.2))) == []
 
 
@@ -283,7 +283,9 @@ def test_silence_is_an_event_and_a_gap_at_the_instant_at_which_it_was_due() -> N
     (fix,) = fixes(station.feed(received(tracking_record(), 1.0)))
     assert station.tick(at(5.9)) == []
     silent = station.tick(at(60))
-    assert events(silent) == [(EventKind.STATION_SILENT, "no record for 5 s")]
+    assert events(silent) == [
+        (EventKind.STATION_SILENT, "no record for 5 s; check the station, its power and its cable")
+    ]
     event = silent[0]
     assert isinstance(event, DeviceEvent)
     assert event.stamp == fix.last_byte.shifted(5_000_000_000)
@@ -320,7 +322,7 @@ def test_a_distance_beyond_what_the_instrument_can_measure_is_refused() -> None:
     assert near.status is Status.OK
     assert (far.status, far.reason) == (
         Status.OUT_OF_RANGE,
-        "slope distance 6000.001 m is beyond max_range_m = 6000",
+        "slope distance 6000.001 m exceeds max_range_m = 6000",
     )
     assert position_mm(far) is None
     assert fixes(decode(decoder(max_range_m=9), [(1.0, tracking_record(10_000))]))[0].status is Status.OUT_OF_RANGE
@@ -329,7 +331,7 @@ def test_a_distance_beyond_what_the_instrument_can_measure_is_refused() -> None:
 def test_coordinates_beyond_what_the_instrument_can_measure_are_refused() -> None:
     (fix,) = fixes(decode(decoder(profile="topcon_classic"), [(1, COORDINATES + b"\x03")]))
     assert (fix.status, fix.north_m) == (Status.OUT_OF_RANGE, pytest.approx(1234566.148))
-    assert "coordinates 1234566.149 m from their origin are beyond max_range_m = 6000" in fix.reason
+    assert "coordinates 1234566.149 m from their origin exceed max_range_m = 6000" in fix.reason
     assert "set the station's own coordinates to 0" in fix.reason
 
 
@@ -373,9 +375,7 @@ def test_a_sokkia_station_with_check_sums_is_not_warned_about() -> None:
 def test_a_reply_that_lost_its_check_sum_on_the_way_is_refused() -> None:
     records = decode(decoder(profile="sokkia_set"), [(1, FULL_REPLY), (2, BARE_REPLY), (3, FULL_REPLY)])
     assert len(fixes(records)) == 2
-    assert [reason for reason, _ in failures(records)] == [
-        "the line ends before its SUM, which the lines before it carry"
-    ]
+    assert [reason for reason, _ in failures(records)] == ["the line has no SUM, but the previous lines had one"]
     assert warnings(records) == []
 
 
@@ -458,13 +458,13 @@ def test_any_captures_yield_sound_records_and_the_same_ones_again(
 @pytest.mark.parametrize(
     ("settings", "reason"),
     [
-        ({"init": ["ZB52\x03"]}, "no command"),
-        ({"init": [""]}, "no command"),
+        ({"init": ["ZB52\x03"]}, "not a command"),
+        ({"init": [""]}, "not a command"),
         ({"profile": "passive", "init": ["ZB52"]}, "sends nothing: remove init"),
         ({"profile": "leica"}, "topcon_gts8"),
         ({"poll": 1}, "Extra inputs"),
         ({"max_speed_m_s": 0}, "greater than 0"),
-        ({"new_target_after_s": 30.0}, "new_target_after_s is gone, remove it"),
+        ({"new_target_after_s": 30.0}, "new_target_after_s no longer exists, remove it"),
     ],
 )
 def test_an_impossible_configuration_is_refused(settings: dict[str, object], reason: str) -> None:

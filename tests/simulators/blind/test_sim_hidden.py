@@ -159,7 +159,7 @@ class TestScene:
         ],
     )
     def test_settings_that_mean_nothing_are_refused(self, rig: Rig, settings: SceneSettings) -> None:
-        with pytest.raises(ValueError, match=r"scene takes|noise"):
+        with pytest.raises(ValueError, match=r"of a scene|a scene needs|noise"):
             draw_scene(rig, 1, settings)
 
 

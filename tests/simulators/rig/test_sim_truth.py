@@ -254,8 +254,8 @@ class TestEffects:
         ("text", "message"),
         [
             ("rust@theta4", "unknown effect 'rust'; known: angle_scale, backlash"),
-            ("backlash", "say where"),
-            ("backlash@theta4:wide=1", "it has width_rad"),
+            ("backlash", "give the place"),
+            ("backlash@theta4:wide=1", "known: width_rad"),
             ("backlash@theta4:width_rad=x", "'x' is not a number"),
             ("backlash@theta4:width_rad=nan", "not a finite number"),
         ],

@@ -76,7 +76,7 @@ def the_journal_has_priorities(service: Service) -> str:
     lines = service.machine.run("journalctl -b -u rigcal -o json --output-fields=PRIORITY,MESSAGE").splitlines()
     said = [(int(line["PRIORITY"]), str(line["MESSAGE"])) for line in map(json.loads, lines)]
     count = {priority: sum(p == priority for p, _ in said) for priority in sorted({p for p, _ in said})}
-    for text, priority in (("acquiring rig", 6), ("the bus went away", 4)):
+    for text, priority in (("acquiring rig", 6), ("connection to the bus lost", 4)):
         found = {p for p, message in said if text in message}
         expect(priority in found, f"{text!r} has priorities {found}, and not {priority}: {count}")
     expect(not any(message.startswith("<") for _, message in said), "a prefix of priorities is left in a message")

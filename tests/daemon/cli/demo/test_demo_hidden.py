@@ -103,7 +103,7 @@ def test_a_pose_that_says_from_which_side_is_reached_from_there(rig: Rig) -> Non
     assert len(stops_of(rig, [at_the_end], dwell_s=4.0)) == 1  # there is no way from below
     with pytest.raises(ValueError, match="theta4 = 1000 deg is beyond its limits"):
         stops_of(rig, [middle(rig) | {"theta4_deg": 1000.0}], dwell_s=4.0)
-    with pytest.raises(ValueError, match="a pose has a number for each of theta1_deg"):
+    with pytest.raises(ValueError, match="a pose needs a number for each of theta1_deg"):
         stops_of(rig, [{"theta1_deg": 1.0}], dwell_s=4.0)
 
 

@@ -128,7 +128,7 @@ def test_offsets_are_those_of_the_first_and_the_last_byte_in_the_stream() -> Non
     assert framer.feed(b"\r\n\x06#" + SET_REPLY[:5]) == [Frame(b"\x06", 2, 2)]
     assert framer.pending == 6
     assert framer.feed(SET_REPLY[5:] + b"\r") == [
-        Garbage(b"#", "clutter before a reply", 3, 3),
+        Garbage(b"#", "garbage before a reply", 3, 3),
         Frame(SET_REPLY, 4, 3 + len(SET_REPLY)),
     ]
     framer.feed(b"00")

@@ -123,7 +123,7 @@ def test_offsets_are_those_of_the_first_and_the_last_byte_in_the_stream() -> Non
     assert framer.feed(ACK_FRAME[:3]) == []
     assert framer.feed(ACK_FRAME[3:] + b"\xff" + TRACKING + b"\x03\r\n") == [
         Frame(b"\x06", 0, 4),
-        Garbage(b"\xff", "no frame: expected printable data and three digits of BCC before ETX", 7, 7),
+        Garbage(b"\xff", "not a frame: expected printable data and three digits of BCC before ETX", 7, 7),
         Frame(TRACKING[:-3], 8, 8 + len(TRACKING)),
     ]
 

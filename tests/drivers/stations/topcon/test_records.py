@@ -49,7 +49,7 @@ def test_a_slope_distance_record_in_tenths_of_mm_in_face_2() -> None:
 
 def test_an_angle_record_is_a_fix_without_a_position() -> None:
     fix = parsed(ANGLES[:-3])
-    assert (fix.status, fix.reason) == (Status.NOT_AVAILABLE, "an angle record: no distance")
+    assert (fix.status, fix.reason) == (Status.NOT_AVAILABLE, "the record has only angles, no distance")
     assert fix.zenith_angle_rad == pytest.approx(dms(90, 53, 56), abs=1e-12)
     assert fix.hz_angle_rad == pytest.approx(dms(354, 51, 5), abs=1e-12)
     assert position_mm(fix) is None
