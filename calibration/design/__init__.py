@@ -1,1 +1,1 @@
-"""Design of poses: which to measure so that a model becomes as true as it can."""
+"""Experimental design: the choice of poses that determine a model best."""

@@ -1,11 +1,14 @@
 """Expected accuracy of a model over the work volume: its own error, apart from the noise of a fix.
 
-Three things make a model's position err. Its parameters have a covariance. It lacks something: joints that yield,
-encoders that are eccentric, slack. Whatever enters through the joints grows with the lever arm of each prism, which
-noise of the fixes does not; so the training data themselves say how much of their scatter is the model's and how much
-the instrument's (`model.joint_errors`). What scatters evenly at all prisms counts as noise of the fixes. And where the
-model has effects that depend on more than the pose, such as slack on the side from which a joint came, a pose by itself
-leaves them open.
+A model's position error has three sources:
+
+1. Its parameters have a covariance.
+2. It lacks some effects, such as compliant joints, eccentric encoders or backlash. Errors that enter through the joints
+   grow with the lever arm of each prism, noise of the fixes does not. The training data therefore show how much of
+   their scatter is due to the model and how much to the instrument (`model.joint_errors`). Scatter that is equal at
+   all prisms counts as noise of the fixes.
+3. Some of its effects may depend on more than the pose, as backlash depends on the direction of approach. A pose alone
+   does not determine them.
 """
 
 from __future__ import annotations
@@ -28,19 +31,19 @@ from calibration.observations import Floats
 from calibration.rig.description import Rig
 
 VOLUME_POSES = 1000
-_PARTS = 3  # of a joint's range, to say where the model is worst
-_NOTABLE = 1.15  # RMS there over the RMS of all
-_MOST = 0.5  # of the RMS over all
-_DRAWS, _SEED = 64, 0  # of errors in every pose
+_PARTS = 3  # equal parts of a joint's range that are compared to find where the model is worst
+_NOTABLE = 1.15  # a part is reported if its RMS exceeds the total RMS by this factor
+_MOST = 0.5  # share of the total RMS above which the undetermined part is reported
+_DRAWS, _SEED = 64, 0  # random errors drawn in every pose
 
 
 @dataclass(frozen=True)
 class Spread:
-    """Norms of the 3-D errors of several poses and prisms taken together, mm.
+    """Statistics of the norms of 3-D errors, pooled over poses and prisms, mm.
 
     Attributes:
-        rms_mm, mean_mm, median_mm: of the norm.
-        p95_mm, p99_mm: 95 % and 99 % of the errors are smaller.
+        rms_mm, mean_mm, median_mm: RMS, mean and median of the norm.
+        p95_mm, p99_mm: 95th and 99th percentile of the norm.
     """
 
     rms_mm: float
@@ -52,16 +55,16 @@ class Spread:
 
 @dataclass(frozen=True)
 class ExpectedAccuracy:
-    """A model's own position errors over the work volume: in each pose normally distributed about zero.
+    """Expected position errors of a model over the work volume, without measurement noise; normal with mean zero.
 
     Attributes:
         rig: the rig description.
-        setup: the set-up in whose station's frame the positions are.
+        setup: the set-up whose station frame the positions refer to.
         readings: (v, joints) poses, deg or mm.
-        parameters_mm2: (v, prisms, 3, 3) covariance of the error that the parameters' covariance makes.
-        lacking_mm2: (v, prisms, 3, 3) covariance of it that what the model lacks makes.
-        open_mm2: (v, prisms, 3, 3) covariance of it by effects that need more than a pose: a direction of approach, a
-            temperature, a load.
+        parameters_mm2: (v, prisms, 3, 3) error covariance due to the covariance of the parameters.
+        lacking_mm2: (v, prisms, 3, 3) error covariance due to effects that the model lacks.
+        open_mm2: (v, prisms, 3, 3) error covariance due to effects that need more than a pose: a direction of approach,
+            a temperature, a load.
     """
 
     rig: Rig
@@ -87,46 +90,46 @@ class ExpectedAccuracy:
 
     @property
     def parameters_mm(self) -> float:
-        """Part by the parameters' covariance, RMS 3-D over all poses and prisms."""
+        """Part due to the covariance of the parameters, RMS 3-D over all poses and prisms."""
         return _size_mm(self.parameters_mm2)
 
     @property
     def lacking_mm(self) -> float:
-        """Part by errors that the model leaves, RMS 3-D over all poses and prisms."""
+        """Part due to effects that the model lacks, RMS 3-D over all poses and prisms."""
         return _size_mm(self.lacking_mm2)
 
     @property
     def open_mm(self) -> float:
-        """Part that poses by themselves leave open, RMS 3-D over all poses and prisms."""
+        """Part due to effects that poses alone do not determine, RMS 3-D over all poses and prisms."""
         return _size_mm(self.open_mm2)
 
     @cached_property
     def _norms_mm(self) -> Floats:
-        """(draws, v, prisms) norms of errors drawn in every pose, always the same draws."""
+        """(draws, v, prisms) norms of random errors in every pose, drawn with a fixed seed."""
         variance = np.maximum(np.linalg.eigvalsh(self._covariance_mm2), 0.0)
         drawn = np.random.default_rng(_SEED).standard_normal((_DRAWS, *variance.shape))
         return np.asarray(np.sqrt((variance * drawn**2).sum(axis=-1)), dtype=np.float64)
 
     @cached_property
     def spread(self) -> Spread:
-        """Spread of the errors of all poses and prisms together."""
+        """Spread of the errors over all poses and prisms."""
         return _spread(self.rms_3d_mm, self._norms_mm)
 
     @cached_property
     def per_prism(self) -> dict[str, Spread]:
-        """Prism -> spread of its errors in all poses."""
+        """Prism -> spread of its errors over all poses."""
         names = self.rig.prism_names
         return {name: _spread(self.rms_3d_mm[:, i], self._norms_mm[:, :, i]) for i, name in enumerate(names)}
 
     @property
     def worst(self) -> tuple[int, int]:
-        """Pose and prism with the largest RMS 3-D error."""
+        """Indices of the pose and prism with the largest RMS 3-D error."""
         pose, prism = np.unravel_index(int(np.argmax(self.rms_3d_mm)), self.rms_3d_mm.shape)
         return int(pose), int(prism)
 
     @property
     def where(self) -> str:
-        """In words: the worst prism; the worst part of a joint's range and what poses leave open, where it is much."""
+        """Sentence naming the worst prism and, where notable, the worst joint range and the undetermined part."""
         worst, text = _NOTABLE * self.rms_mm, ""
         for index, joint in enumerate(self.rig.joints):
             edges = np.linspace(*joint.limits, _PARTS + 1)
@@ -142,7 +145,7 @@ class ExpectedAccuracy:
         return f"largest at prism {prism} ({spread.rms_mm:.2g} mm RMS){text}"
 
     def as_dict(self) -> dict[str, object]:
-        """Return a JSON object: the spread over poses and prisms and of each prism, its parts, the worst pose."""
+        """Return a JSON object with the spread in total and for each prism, its parts, and the worst pose."""
         pose, prism = self.worst
         return {
             **asdict(self.spread),
@@ -170,16 +173,16 @@ def predicted_accuracy(
     parameters_share: float = 1.0,
     lacking_share: float = 1.0,
 ) -> ExpectedAccuracy:
-    """Predict the accuracy by what is known of a rig.
+    """Predict the accuracy from the knowledge of a rig.
 
     Args:
-        knowledge: where to linearise.
-        root: (p + k, r) covariance of parameters and coefficients = root @ root'; after a plan it is smaller than the
-            knowledge's own.
+        knowledge: linearisation point, and the effects of the model.
+        root: (p + k, r) root of the covariance of parameters and coefficients, root @ root'. After a plan it is smaller
+            than that of `knowledge`.
         readings: (v, joints) poses of the work volume, deg or mm.
-        joint_error_scale: what the model lacks, as `joint_error_scale` gives it.
-        parameters_share: share of the variance by parameters that a residual learner leaves.
-        lacking_share: share that it leaves of the variance by what the model lacks.
+        joint_error_scale: size of the joint errors that the model lacks, as returned by `joint_error_scale`.
+        parameters_share: share of the variance due to parameters that remains after a residual learner.
+        lacking_share: share of the variance due to lacking effects that remains after a residual learner.
     """
     rig = knowledge.chain.rig
     lin = knowledge.linearise(readings)
@@ -200,15 +203,15 @@ def predicted_accuracy(
 def expected_accuracy(
     model: CalibratedModel, rng: np.random.Generator, *, poses: int = VOLUME_POSES
 ) -> ExpectedAccuracy:
-    """Compute the accuracy that a calibrated model expects, in random poses of the work volume.
+    """Compute the expected accuracy of a calibrated model in random poses of the work volume.
 
-    Of several set-ups it is the one that `design.knowledge.setup_of` chooses. What a learned residual removed of the
-    training data's scatter is removed here.
+    Of several set-ups, `design.knowledge.setup_of` chooses one. The share of the training data's scatter that a learned
+    residual removed is removed here too.
 
     Args:
         model: the model.
-        rng: draws the poses.
-        poses: number of them.
+        rng: random generator for the poses.
+        poses: number of poses.
 
     Raises:
         UnsafeError: the rig can take no pose inside its joint limits.
@@ -220,14 +223,15 @@ def expected_accuracy(
 
 
 def accuracy_of_model(model: CalibratedModel, knowledge: Knowledge, root: Floats, readings: Floats) -> ExpectedAccuracy:
-    """Predict the accuracy of a calibrated model whose residual learner is kept.
+    """Predict the accuracy of a calibrated model, including its residual learner.
 
-    The learner lowers the error that the kinematics leave as it does the whole excess: right where the excess is all
-    the model's, and on the safe side where a part of it is noise of the fixes, from which no learner can take.
+    The learner is assumed to reduce the error left by the kinematics in the same proportion as the whole excess
+    variance. This is exact where all excess is due to the model, and conservative where part of it is noise of the
+    fixes, which no learner can reduce.
 
     Args:
         model: the model.
-        knowledge: of it, or of the same machine at another set-up.
+        knowledge: knowledge of the model, or of the same machine at a different set-up.
         root: as for `predicted_accuracy`.
         readings: (v, joints) poses of the work volume, deg or mm.
     """
@@ -255,6 +259,6 @@ def _rms(values: Floats) -> float:
 
 
 def _spread(rms_3d_mm: Floats, norms_mm: Floats) -> Spread:
-    """Return the spread of errors whose RMS is known in each pose, the other figures from drawn norms."""
+    """Return the spread of errors: the RMS from the RMS of each pose, the other statistics from drawn norms."""
     median, p95, p99 = np.percentile(norms_mm, [50.0, 95.0, 99.0]).tolist()
     return Spread(_rms(rms_3d_mm), float(norms_mm.mean()), median, p95, p99)

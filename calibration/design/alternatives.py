@@ -1,4 +1,4 @@
-"""Effects that a plan is to tell apart, each reduced to the few coefficients that matter."""
+"""Effects that a plan is to distinguish, each reduced to the few coefficients that matter."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from calibration.effects.library import library
 from calibration.errors import DataError
 from calibration.observations import Floats
 
-_LEFT = 1e-3  # of the mean square of what an effect may do; no fix shows the curves that make up less
-_MOST = 12  # coefficients: a curve of many has its broad features in the first
-_CHANGES = 0.05  # of what an effect moves, RMS
-_ROWS = 1000  # that its coefficients are found from
+_LEFT = 1e-3  # share of an effect's mean square that may be dropped; fixes cannot resolve so small a part
+_MOST = 12  # largest number of coefficients; the first ones describe the broad features of a curve
+_CHANGES = 0.05  # relative RMS change of the displacement from which on an effect counts as changed
+_ROWS = 1000  # rows from which the reduced coefficients are computed
 _GOLDEN = (math.sqrt(5.0) - 1.0) / 2.0
 
 
@@ -31,11 +31,11 @@ class Alternative:
 
     Attributes:
         name: `family@where`.
-        choices: the variants that it may take; they have c coefficients together.
-        weights: of the variants beforehand, their sum 1.
-        mixing: (c, k) what these do is that of k <= c coefficients, independent and of size 1: `mixing` takes unit
-            directions of the c in prior sigmas onto them.
-        found: (k,) their values; zero where none were found.
+        choices: the possible variants, with c coefficients in total.
+        weights: prior probabilities of the variants, with sum 1.
+        mixing: (c, k) reduction to k <= c independent coefficients of unit prior sigma. Each column is the direction of
+            one of them in the c original coefficients, in their prior sigmas.
+        found: (k,) fitted values of the reduced coefficients; zero where there is no fit.
     """
 
     name: str
@@ -48,16 +48,16 @@ class Alternative:
     def of(
         cls, name: str, choices: tuple[Choice, ...], context: EffectContext, found: Floats | None = None
     ) -> Alternative:
-        """Reduce an effect to the coefficients that matter in some observations: its variants repeat each other.
+        """Reduce an effect to the coefficients that matter in some observations, as its variants overlap.
 
         Args:
             name: `family@where`.
-            choices: the variants that it may take.
+            choices: the possible variants.
             context: the observations.
-            found: (c,) values of the coefficients, where there are any.
+            found: (c,) fitted values of the coefficients; None where there is no fit.
 
         Raises:
-            DataError: it does nothing in any of them.
+            DataError: the effect is zero in all observations.
         """
         odds = [library()[choice.family].odds(choice.settings) for choice in choices]
         weights = tuple(value / sum(odds) for value in odds)
@@ -78,17 +78,17 @@ class Alternative:
         return int(self.mixing.shape[1])
 
     @property
-    def goes_by_travel(self) -> bool:
-        """True if it grows with the path of its joint."""
-        return library()[self.choices[0].family].goes_by_travel
+    def depends_on_travel(self) -> bool:
+        """True if the effect grows with the path that its joint travels."""
+        return library()[self.choices[0].family].depends_on_travel
 
     def moved_mm(self, context: EffectContext) -> Floats:
-        """(n, 3, k) displacements by its coefficients: as found, or each of unit size where none were found."""
+        """(n, 3, k) displacements due to the fitted coefficients, or to unit coefficients where there is no fit."""
         moved = self.columns(context).moved_mm(context.to_station(context.located.joint_jacobian))
         return moved * (self.found if self.found.any() else 1.0)
 
     def columns(self, context: EffectContext) -> EffectColumns:
-        """Return the effect's columns for the observations of a context, one for each of its k coefficients."""
+        """Return the effect's columns for the observations of a context, one for each of the k coefficients."""
         column, shift = np.zeros((len(context), self.size)), np.zeros((0, self.size))
         first = 0
         for choice, weight in zip(self.choices, self.weights, strict=True):
@@ -104,21 +104,21 @@ class Alternative:
 
 
 def name_of(effect: str | FittedEffect) -> str:
-    """`family@where`."""
+    """Return the name `family@where` of an effect."""
     return effect if isinstance(effect, str) else f"{effect.family}@{effect.where}"
 
 
 def conditions_of(knowledge: Knowledge, effect: str, readings: Floats, conditions: Conditions) -> tuple[str, ...]:
-    """Name the conditions without which an effect is not known.
+    """Return the names of the conditions that an effect requires as inputs.
 
     Args:
-        knowledge: of the rig.
+        knowledge: knowledge of the rig.
         effect: `family@where`.
         readings: (n, joints) poses.
-        conditions: all that may be chosen for them.
+        conditions: all conditions that may be chosen for the poses.
 
     Raises:
-        DataError: it needs something that no condition gives.
+        DataError: the effect needs an input that no condition provides.
     """
     name, _, where = effect.partition("@")
     family = library()[name]
@@ -136,10 +136,16 @@ def conditions_of(knowledge: Knowledge, effect: str, readings: Floats, condition
 def alternative_of(
     knowledge: Knowledge, effect: str | FittedEffect, readings: Floats, conditions: Conditions
 ) -> Alternative:
-    """Prepare an effect, in all its variants or as it was found, for poses (n, joints).
+    """Prepare an effect for poses: all variants of a named effect, or the fitted form of a fitted one.
+
+    Args:
+        knowledge: knowledge of the rig.
+        effect: `family@where`, or a fitted effect.
+        readings: (n, joints) poses, deg or mm.
+        conditions: conditions of the poses.
 
     Raises:
-        DataError: no pose shows it.
+        DataError: the effect is zero in all poses.
     """
     context = knowledge.context(readings, conditions)
     if isinstance(effect, FittedEffect):
@@ -155,16 +161,16 @@ def alternative_of(
 def changing(
     knowledge: Knowledge, effects: Sequence[str | FittedEffect], readings: Floats, conditions: Conditions
 ) -> Mapping[tuple[str, ...], tuple[str, ...]]:
-    """Find which of several effects change with each kind of condition, by computing their displacements.
+    """Find which effects change with each kind of condition, by computing their displacements.
 
     Args:
-        knowledge: of the rig.
-        effects: that these poses show.
+        knowledge: knowledge of the rig.
+        effects: effects that are not zero in these poses.
         readings: (n, joints) poses.
-        conditions: all that may be chosen for them.
+        conditions: all conditions that may be chosen for the poses.
 
     Returns:
-        Names of the conditions that change together -> `family@where` of the effects that change with them.
+        Names of conditions that change together -> `family@where` of the effects that change with them.
     """
     alternatives = [alternative_of(knowledge, effect, readings, conditions) for effect in effects]
     before, found = knowledge.context(readings, conditions), {}
@@ -175,19 +181,21 @@ def changing(
 
     for kind in kinds_of(knowledge.chain.rig):
         after = knowledge.context(readings, changed(conditions, kind))
-        # A path goes on with the poses, and not with the hours between them.
-        asked = [alternative for alternative in alternatives if kind != ("time_s",) or not alternative.goes_by_travel]
+        # A joint's path grows with the poses and not with the time between them.
+        asked = [
+            alternative for alternative in alternatives if kind != ("time_s",) or not alternative.depends_on_travel
+        ]
         found[kind] = tuple(alternative.name for alternative in asked if is_changed(alternative, after))
     return found
 
 
 def joined_columns(alternatives: tuple[Alternative, ...], context: EffectContext) -> EffectColumns:
-    """Join the coefficients of all alternatives, one after the other."""
+    """Concatenate the columns of all alternatives, in order."""
     return joined([alternative.columns(context) for alternative in alternatives], len(context))
 
 
 def _scaled(choice: Choice, context: EffectContext, weight: float) -> EffectColumns:
-    """A variant with coefficients of size 1, as plausible as it is among the others."""
+    """Return a variant's columns in units of the prior sigma, scaled by the root of its prior probability."""
     raw = choice.columns(context)
     sigma = raw.prior_sigma * math.sqrt(weight)
     shift = None if raw.shift_mm is None else raw.shift_mm * sigma
@@ -195,14 +203,14 @@ def _scaled(choice: Choice, context: EffectContext, weight: float) -> EffectColu
 
 
 def _spread(rows: int) -> NDArray[np.intp]:
-    """Rows spread evenly, in their order, in no step with the prisms."""
+    """Return evenly spread row indices in rising order, not in step with the prisms."""
     if rows <= _ROWS:
         return np.arange(rows)
     return np.unique((rows * (np.arange(_ROWS) * _GOLDEN % 1.0)).astype(np.intp))
 
 
 def _flat(columns: EffectColumns) -> Floats:
-    """(3 n, k) displacements; no rows where there are none."""
+    """(3 n, k) displacements of the prisms; no rows where the effect moves joints only."""
     if columns.shift_mm is None:
         return np.empty((0, len(columns)))
     return columns.shift_mm.reshape(-1, len(columns))

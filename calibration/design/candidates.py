@@ -1,4 +1,4 @@
-"""Candidate poses: drawn inside the joint limits, reachable, in view of the station, each under its conditions."""
+"""Candidate poses: drawn inside the joint limits, reachable and in view of the station, each with its conditions."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from calibration.observations import Floats
 
 CANDIDATES = 10_000
 _BATCHES = 10
-_MARGIN = 0.01  # of a joint's range, kept from its limits
-_NEAR = 100  # to each pose
-_WIDTHS = 0.02, 0.2  # of a joint's range, 1 sigma
-_TRIED = 64  # poses in which conditions are tried
+_MARGIN = 0.01  # distance kept from a joint's limits, as a share of its range
+_NEAR = 100  # neighbours drawn for each pose
+_WIDTHS = 0.02, 0.2  # smallest and largest 1 sigma step of a neighbour, as a share of a joint's range
+_TRIED = 64  # poses used to find which conditions matter
 
 
 @dataclass(frozen=True)
@@ -28,8 +28,8 @@ class Candidates:
 
     Attributes:
         readings: (n, joints) deg or mm.
-        conditions: under which each is to be measured.
-        seen: (n, prisms) prisms in view.
+        conditions: the conditions under which each pose is to be measured.
+        seen: (n, prisms) mask of the prisms in view.
     """
 
     readings: Floats
@@ -59,7 +59,7 @@ class Candidates:
         return Candidates(self.readings[which], conditions, self.seen[which])
 
     def under(self, names: Collection[str]) -> Candidates:
-        """Keep the conditions of these names alone."""
+        """Keep only the named conditions."""
         return replace(self, conditions=under(self.conditions, names))
 
 
@@ -72,21 +72,21 @@ def draw(
     begin_s: float = 0.0,
     payload_kg: float = 0.0,
 ) -> Candidates:
-    """Draw poses that the rig can take and in which the station sees a prism.
+    """Draw poses that the rig can take and in which the station sees at least one prism.
 
-    Half of them are drawn evenly between the joint limits, half lean to the limits (arcsine law), where errors show
-    most.
+    Half of them are uniform between the joint limits. The other half follows the arcsine distribution, which favours
+    poses near the limits, where errors are largest.
 
     Args:
-        knowledge: of the rig.
-        at: what stands around it.
-        rng: draws.
-        count: how many poses.
-        begin_s: `time_s` at which they can be measured, at the earliest.
+        knowledge: knowledge of the rig.
+        at: station and floor.
+        rng: random generator.
+        count: number of poses.
+        begin_s: earliest `time_s` at which the poses can be measured.
         payload_kg: as for `conditions.drawn`.
 
     Raises:
-        UnsafeError: there is none.
+        UnsafeError: no such pose was found.
     """
     chain = knowledge.chain
     low, high = limits(chain.rig)
@@ -114,11 +114,17 @@ def draw(
 
 
 def near(knowledge: Knowledge, at: Site, rng: np.random.Generator, poses: Candidates) -> tuple[Candidates, Integers]:
-    """Draw poses that differ little from given ones in some of the joints, under the same conditions.
+    """Draw neighbours of given poses: some joints differ a little, the conditions are the same.
+
+    Args:
+        knowledge: knowledge of the rig.
+        at: station and floor.
+        rng: random generator.
+        poses: the given poses.
 
     Returns:
-        The given poses and those near them that the rig can take and in which the station sees as many prisms; for
-        each the number of the given pose, which is the first of its own.
+        The given poses and their neighbours that the rig can take and in which at least the same prisms are in view;
+        and for each the index of its given pose, (n,). Each given pose comes before its neighbours.
     """
     low, high = limits(knowledge.chain.rig)
     margin = _MARGIN * (high - low)
@@ -134,10 +140,19 @@ def near(knowledge: Knowledge, at: Site, rng: np.random.Generator, poses: Candid
 
 
 def work_volume(knowledge: Knowledge, at: Site, rng: np.random.Generator, count: int) -> Floats:
-    """Draw poses (count, joints) evenly among those that the rig can take, in view or not.
+    """Draw poses uniformly among those that the rig can take, whether in view of the station or not.
+
+    Args:
+        knowledge: knowledge of the rig.
+        at: station and floor.
+        rng: random generator.
+        count: number of poses.
+
+    Returns:
+        (m, joints) poses, deg or mm; m < count where most draws are unreachable.
 
     Raises:
-        UnsafeError: there is none.
+        UnsafeError: no such pose was found.
     """
     low, high = limits(knowledge.chain.rig)
     found = np.empty((0, len(low)))

@@ -1,7 +1,7 @@
-"""Conditions of a pose: the side it is approached from, motion, dwell, time, temperature, payload, pressures.
+"""Conditions of a pose: direction of approach, motion, dwell, time, temperature, payload, pressures.
 
-Some effects show only where these differ. A plan varies the ones that the effects in question need, between levels
-that an operator can bring about.
+Some effects are visible only where conditions differ. A plan varies those conditions that the effects in question need,
+between levels that an operator can set.
 """
 
 from __future__ import annotations
@@ -14,32 +14,32 @@ from calibration.observations import Floats
 from calibration.rig.description import Rig
 
 Conditions = Mapping[str, Floats]
-"""Columns of observations beside the joints' readings -> (n,) of each pose; `fixes`, how many of each prism."""
+"""Optional column of observations -> (n,) its value in each pose; `fixes` is the number of fixes of each prism."""
 
-FIXES = 10  # of each prism at a standstill: seconds each, and their mean has that much less of the station's noise
+FIXES = 10  # per prism at a standstill: each takes seconds, and the variance of their mean is smaller by this factor
 
 DWELLS_S = (10.0, 120.0)
 TEMPERATURES_DEGC = (5.0, 25.0)
 PRESSURES_BAR = (50.0, 150.0)
 ROUNDS_S = (0.0, 14400.0, 28800.0, 43200.0)
 _POSE_S = 60.0  # from one fix of a round to the next
-_MOVING = 0.5  # share of poses that may be measured on the move
-_PACE = 0.1  # of a joint's greatest rate, at most: faster, an unsure instant hides as much as speed shows
-_LOAD = 0.05  # of the machine's weight, where the rig file names no payload
-_SLOW = ("time_s", "temperature_degC", "payload_kg")  # nobody changes these from pose to pose
+_MOVING = 0.5  # share of poses that may be measured in motion
+_PACE = 0.1  # largest share of a joint's greatest rate; at higher rates the timing error outweighs the information
+_LOAD = 0.05  # payload as a share of the machine's weight, where the rig file names no payload
+_SLOW = ("time_s", "temperature_degC", "payload_kg")  # not practical to change from pose to pose
 
 
 def drawn(
     rig: Rig, count: int, rng: np.random.Generator, *, begin_s: float = 0.0, payload_kg: float = 0.0
 ) -> Conditions:
-    """Draw all conditions of `count` poses, each among its levels.
+    """Draw all conditions of `count` poses, each from its levels.
 
     Args:
         rig: the rig description.
-        count: how many poses.
-        rng: draws.
+        count: number of poses.
+        rng: random generator.
         begin_s: `time_s` of the first round.
-        payload_kg: that the machine has carried; where it has carried none, as the rig file has it.
+        payload_kg: payload that the machine has carried; 0 for the payload of the rig file.
     """
     sides = rng.choice([-1.0, 1.0], (count, len(rig.joints)))
     pace = _PACE * rng.random(sides.shape) * (rng.random(count) < _MOVING)[:, None]
@@ -58,7 +58,7 @@ def drawn(
 
 
 def under(conditions: Conditions, names: Collection[str]) -> Conditions:
-    """Keep the conditions of some names; a pose passed on the move has no dwell and one fix."""
+    """Keep only the named conditions; a pose measured in motion gets no dwell and one fix."""
     out = {name: values for name, values in conditions.items() if name in names}
     rates = [values for name, values in out.items() if name.endswith("_rate")]
     if rates:
@@ -68,7 +68,7 @@ def under(conditions: Conditions, names: Collection[str]) -> Conditions:
 
 
 def kinds_of(rig: Rig) -> tuple[tuple[str, ...], ...]:
-    """Conditions of a rig, grouped by what changes together."""
+    """Return the conditions of a rig, in groups that change together."""
     joints = rig.joint_names
     payload = [("payload_kg",)] if any(mass.payload for mass in rig.masses) else []
     return (
@@ -83,11 +83,11 @@ def kinds_of(rig: Rig) -> tuple[tuple[str, ...], ...]:
 
 
 def needed(rig: Rig, is_known: Callable[[Collection[str]], bool]) -> tuple[str, ...] | None:
-    """Find the fewest conditions with which an effect knows what it needs; None if none do.
+    """Return a minimal set of conditions that provides all inputs of an effect, or None if no set does.
 
     Args:
         rig: the rig description.
-        is_known: True if the effect knows what it needs under conditions of these names.
+        is_known: True if conditions of these names provide all inputs of the effect.
     """
     kinds = kinds_of(rig)
     kept = [name for kind in kinds for name in kind]
@@ -101,7 +101,7 @@ def needed(rig: Rig, is_known: Callable[[Collection[str]], bool]) -> tuple[str, 
 
 
 def changed(conditions: Conditions, kind: Collection[str]) -> Conditions:
-    """Change the conditions of one kind as much as a plan can."""
+    """Change the conditions of one kind by the largest amount that a plan allows."""
     out = dict(conditions)
     for name in kind:
         values = conditions[name]
@@ -115,12 +115,12 @@ def changed(conditions: Conditions, kind: Collection[str]) -> Conditions:
 
 
 def slow(names: Collection[str]) -> tuple[str, ...]:
-    """Conditions by which a plan is divided into blocks, the slowest to change first."""
+    """Return the conditions that divide a plan into blocks, slowest to change first."""
     return (*(name for name in _SLOW if name in names), *sorted(name for name in names if name.endswith("_bar")))
 
 
-def one_after_another(conditions: Conditions) -> Conditions:
-    """Give poses measured in this order instants of their own within a round."""
+def with_distinct_times(conditions: Conditions) -> Conditions:
+    """Give each pose a distinct `time_s` within its round, in the order of measurement."""
     if "time_s" not in conditions:
         return conditions
     times: list[float] = []
@@ -130,18 +130,18 @@ def one_after_another(conditions: Conditions) -> Conditions:
 
 
 def instructions(rig: Rig, conditions: Conditions) -> tuple[str, ...]:
-    """Instructions for the operator, a sentence for each condition of a plan."""
+    """Return instructions for the operator, one sentence for each condition of a plan."""
     out = []
     sides = [joint.name for joint in rig.joints if f"{joint.name}_dir" in conditions]
     if sides:
         out.append(
-            f"come to the pose with {' and '.join(sides)} from below where the column of its direction has 1, and from "
-            f"above where it has -1"
+            f"approach the pose with {' and '.join(sides)} from below where its direction column is 1, and from above "
+            f"where it is -1"
         )
     if any(name.endswith("_rate") for name in conditions):
-        out.append("where rates are given, take the fix on the move, as the boom passes the pose at these rates")
+        out.append("where rates are given, take the fix in motion, as the boom passes the pose at these rates")
     if "fixes" in conditions:
-        out.append("take as many fixes of each prism as the column fixes says, all under the number of their pose")
+        out.append("take as many fixes of each prism as the column fixes gives, all under the number of their pose")
     if "dwell_s" in conditions:
         out.append("let the boom stand for dwell_s before the fix")
     if "payload_kg" in conditions:
@@ -152,7 +152,7 @@ def instructions(rig: Rig, conditions: Conditions) -> tuple[str, ...]:
         hours = np.ptp(conditions["time_s"]) / 3600.0
         out.append(f"measure at time_s, {hours:.1f} hours from first to last, without moving the station")
     out += [
-        f"bring the cylinder to about {name}, by what the boom carries or pushes against"
+        f"bring the cylinder to about {name}, by the load that the boom carries or pushes against"
         for name in sorted(conditions)
         if name.endswith("_bar")
     ]

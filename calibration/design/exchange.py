@@ -1,9 +1,9 @@
-"""Choosing rows of a linear model: greedy additions, then exchanges, under a criterion of the posterior covariance.
+"""Optimal design for a linear model: greedy additions, then exchanges, with a criterion of the posterior covariance.
 
-Every candidate is a block of r rows W of a whitened Jacobian in prior units, so that the information before is the
-identity and a set has the covariance C = (I + sum W'W)^-1. Adding a block lowers it by C W' G^-1 W C with
-G = I + W C W' (Sherman, Morrison and Woodbury), so no candidate needs an inverse of the whole. The exchange is
-Fedorov's (1972), restricted to the candidates that gain most, as the KL-exchange of Atkinson, Donev and Tobias
+Every candidate is a block of r rows W of a whitened Jacobian in prior units. The prior information is then the
+identity, and a set has the covariance C = (I + sum W'W)^-1. Adding a block lowers C by C W' G^-1 W C with
+G = I + W C W' (Sherman, Morrison and Woodbury), so no candidate needs the inverse of the full matrix. The exchange is
+Fedorov's (1972), restricted to the candidates of largest gain, as in the KL-exchange of Atkinson, Donev and Tobias
 (Optimum Experimental Designs, 2007, section 12.6).
 """
 
@@ -22,25 +22,30 @@ from calibration.observations import Floats
 
 Integers = NDArray[np.intp]
 
-_AT_ONCE = 256  # candidates looked at anew in one go
+_AT_ONCE = 256  # candidates whose gains are recomputed at once
 _SHORTLIST = 400
 _SWEEPS = 6
 _WORTHWHILE = 1e-4
-_TOGETHER = 1000  # candidates, so that the work arrays stay small
+_TOGETHER = 1000  # candidates per batch, so that the work arrays stay small
 
 
 class Criterion(Protocol):
     """Criterion that a design maximises."""
 
     def value(self, information: Floats) -> float:
-        """Value of an information (q, q), the prior's included; larger is better."""
+        """Value of an information matrix (q, q) that includes the prior; larger is better."""
 
     def gain(self, information: Floats, blocks: Floats) -> Floats:
-        """(m,) gains in `value` by each of m blocks (m, r, q)."""
+        """(m,) increase of `value` by each of m blocks.
+
+        Args:
+            information: (q, q) information matrix without the blocks, including the prior.
+            blocks: (m, r, q) blocks of r rows.
+        """
 
 
 class Determinant:
-    """D-optimal: the volume of the confidence ellipsoid of all parameters, as -log det."""
+    """D-optimality: minus the log volume of the confidence ellipsoid, -log det of the covariance."""
 
     def value(self, information: Floats) -> float:
         return float(np.linalg.slogdet(information)[1])
@@ -53,10 +58,10 @@ class Determinant:
 
 @dataclass(frozen=True)
 class Accuracy:
-    """V-optimal: mean variance of predictions over the work volume, as -log.
+    """V-optimality: minus the log of the mean prediction variance over the work volume.
 
     Attributes:
-        root: (q, k) with root @ root' the mean of J'J over the volume, in prior units.
+        root: (q, k) root of the mean of J'J over the volume, root @ root', in prior units.
     """
 
     root: Floats
@@ -76,11 +81,11 @@ class Accuracy:
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """One of several models, as what is known already leaves it.
+    """One of several models, given all knowledge before the design.
 
     Attributes:
-        mean: (q,) of all parameters; zero for those that it has not.
-        free: (f,) indices of those that it has, whose covariance is the inverse of their information.
+        mean: (q,) mean of all parameters; zero for parameters that the model lacks.
+        free: (f,) indices of the model's parameters. Their covariance is the inverse of their information.
     """
 
     mean: Floats
@@ -89,21 +94,22 @@ class Hypothesis:
 
 @dataclass(frozen=True)
 class Discrimination:
-    """The log odds that a design is expected to bring for a true model over another, whichever two they are.
+    """The log odds that a design is expected to bring for a true model against a false one, for any such pair.
 
-    They are the Kullback-Leibler divergence of what the one predicts from what the other predicts (Box and Hill,
-    Technometrics 9, 1967),
+    They are the Kullback-Leibler divergence between the predictions of the two models (Box and Hill, Technometrics 9,
+    1967),
 
         1/2 (E |d|^2 - tr(C A) + ln|before + A| / |before| - ln|before_i + A_i| / |before_i|)
 
-    with d the parameters of the true model less those that the other fits in the end, C = (before + A)^-1 of the other,
-    A what the design tells, and the index i for the true one: the other predicts something else, and it has freedom
-    that it has no need of. The least of them counts, softly.
+    where d is the true model's parameters minus those that the other model fits after the design,
+    C = (before + A)^-1 of the other model, A the information of the design, and i denotes the true model. The first
+    terms measure how much the predictions differ. The last two penalise free parameters that the other model does not
+    need. The criterion is a soft minimum over the pairs.
 
     Attributes:
         models: two or more.
-        before: (q, q) information of the prior and of all that is known already.
-        pairs: indices of a true model and of one that it is to be told from.
+        before: (q, q) information of the prior and of all earlier measurements.
+        pairs: pairs of indices: a true model, and a model to distinguish from it.
     """
 
     models: tuple[Hypothesis, ...]
@@ -135,7 +141,7 @@ class Discrimination:
         return values
 
     def log_odds(self, information: Floats) -> Floats:
-        """(pairs,) expected log odds of the one, if it is true, over the other."""
+        """(pairs,) expected log odds of the true model against the other one."""
         return self._log_odds(information, self._left(information))
 
     def _log_odds(self, information: Floats, left: Sequence[Floats]) -> Floats:
@@ -153,7 +159,7 @@ class Discrimination:
 
     @cached_property
     def _differences(self) -> list[Floats]:
-        """(q, 1 + f) of each pair, the true model's parameters less the other's: means, and what is unknown of them."""
+        """(q, 1 + f) for each pair: difference of the mean parameters, and the root of the true model's covariance."""
         found = []
         for true, other in ((self.models[i], self.models[j]) for i, j in self.pairs):
             root = np.zeros((len(self.before), 1 + len(true.free)))
@@ -163,7 +169,7 @@ class Discrimination:
         return found
 
     def _left(self, information: Floats) -> list[Floats]:
-        """(q, 1 + f) of each pair, the same once the other is fitted to what the design tells."""
+        """(q, 1 + f) for each pair: `_differences` after the other model is fitted to the design's measurements."""
         added, found = information - self.before, []
         for (_, j), difference in zip(self.pairs, self._differences, strict=True):
             free, left = self.models[j].free, difference.copy()
@@ -173,15 +179,15 @@ class Discrimination:
 
 
 def choose(blocks: Floats, count: int, criterion: Criterion, before: Floats | None = None) -> Integers:
-    """Choose different blocks, greedily and then by exchanges.
+    """Choose distinct blocks, greedily and then by exchanges.
 
-    Gains are looked at anew only where an old one is still among the largest. For the determinant they never grow as
-    the set does, so this finds exactly the best candidate each time (Minoux 1978).
+    Gains are recomputed only where an old gain is still among the largest. For the determinant, gains never grow with
+    the set, so this finds the exact best candidate in every step (Minoux 1978).
 
     Args:
         blocks: (n, r, q) candidates.
-        count: number to choose.
-        criterion: value to maximise.
+        count: number of blocks to choose.
+        criterion: criterion to maximise.
         before: (q, q) information of earlier measurements, W'W in prior units; nothing by default.
 
     Returns:
@@ -196,14 +202,14 @@ def choose(blocks: Floats, count: int, criterion: Criterion, before: Floats | No
 
 
 def improve(blocks: Floats, near: Integers, criterion: Criterion, before: Floats | None = None) -> Integers:
-    """Choose one block for each of several poses, the best of those near it while the others stay.
+    """Replace each of several poses by the best block near it, while the other poses are held fixed.
 
-    Coordinate exchange (Meyer and Nachtsheim, Technometrics 37, 1995), whole poses being the coordinates.
+    Coordinate exchange (Meyer and Nachtsheim, Technometrics 37, 1995) with whole poses as the coordinates.
 
     Args:
-        blocks: (n, r, q).
-        near: (n,) number of the pose, from 0, that each is near; the first of each is the pose's own, and stays where
-            no other is better.
+        blocks: (n, r, q) candidates.
+        near: (n,) index of the pose that each block is near. The first block of each pose is the pose itself, and is
+            kept where no other is better.
         criterion: as for `choose`.
         before: as for `choose`.
 
@@ -228,14 +234,19 @@ def covariance_of(blocks: Floats) -> Floats:
 
 
 def information_of(blocks: Floats, before: Floats | None = None) -> Floats:
-    """(q, q) the inverse of that covariance, `before` as for `choose`."""
+    """(q, q) posterior information in prior units, the inverse of `covariance_of`.
+
+    Args:
+        blocks: (n, r, q) measured blocks.
+        before: as for `choose`.
+    """
     rows = blocks.reshape(-1, blocks.shape[2])
     information: Floats = _known(blocks, before) + rows.T @ rows
     return information
 
 
 def _known(blocks: Floats, before: Floats | None) -> Floats:
-    """(q, q) the prior's information, and that of what has been measured."""
+    """(q, q) information of the prior and of earlier measurements."""
     prior: Floats = np.eye(blocks.shape[2])
     return prior if before is None else prior + before
 
@@ -247,7 +258,7 @@ def _greedy(blocks: Floats, count: int, criterion: Criterion, known: Floats) -> 
     for _ in range(count):
         fresh = np.zeros(len(blocks), dtype=bool)
         while True:
-            # The likeliest first; what has been looked at in this round is not looked at again.
+            # Largest bound first. Gains that were recomputed in this round are up to date.
             best = int(np.argmax(bound))
             if fresh[best]:
                 break
@@ -263,7 +274,7 @@ def _greedy(blocks: Floats, count: int, criterion: Criterion, known: Floats) -> 
 
 
 def _sweep(blocks: Floats, chosen: list[int], criterion: Criterion, known: Floats) -> bool:
-    """Try to exchange every chosen block for a better one, in place; return True if that was worthwhile."""
+    """Exchange each chosen block for a better one where possible, in place; return True if the gain was worthwhile."""
     rows = blocks[chosen].reshape(-1, blocks.shape[2])
     information = known + rows.T @ rows
     before = criterion.value(information)
@@ -294,7 +305,7 @@ def _times(blocks: Floats, matrix: Floats) -> Floats:
 
 
 def _grown(projected: Floats, blocks: Floats) -> Floats:
-    """(m, r, r) G = I + W C W' of W C and W, each (m, r, q)."""
+    """(m, r, r) G = I + W C W' from W C and W, each (m, r, q)."""
     grown: Floats = np.eye(blocks.shape[1]) + projected @ blocks.transpose(0, 2, 1)
     return grown
 
@@ -305,6 +316,6 @@ def _inverse(information: Floats) -> Floats:
 
 
 def _block(matrix: Floats, which: Integers) -> Floats:
-    """(f, f) of a matrix (q, q)."""
+    """(f, f) submatrix of a matrix (q, q)."""
     block: Floats = matrix[np.ix_(which, which)]
     return block

@@ -1,8 +1,8 @@
-"""The accuracy to expect from what was measured so far, and what the next poses will bring.
+"""Expected accuracy from the rows measured so far, and its improvement by the next poses.
 
 The measured rows are fitted as for a model without effects. The covariance of that fit, with the noise that it found,
-gives the expected accuracy over the work volume; the Jacobians of poses that are not measured yet give what they bring.
-Before there are enough rows for a model, build tolerances hold what the rows do not show.
+gives the expected accuracy over the work volume. The Jacobians of poses not yet measured give the improvement by them.
+Before there are enough rows for a model, build tolerances constrain the parameters that the rows do not determine.
 """
 
 from __future__ import annotations
@@ -29,27 +29,27 @@ from calibration.numerics.matrices import root_of
 from calibration.observations import Floats, Observations
 from calibration.rig.description import Rig
 
-LEAST_POSES = 4  # fewer do not tell where the station stands
-FORECAST = 5  # poses that the meter looks ahead
+LEAST_POSES = 4  # fewer do not determine the station's place
+FORECAST = 5  # number of further poses for which the meter predicts the accuracy
 VOLUME = 400  # poses of the work volume; a larger sample changes the RMS by less than 2 %
 _CANDIDATES = 3000
-_CHUNK = 10  # poses that are ordered for short motion among themselves: the most telling ones come first
+_CHUNK = 10  # poses per chunk, ordered for short motion within it; the most informative chunk comes first
 _SEED = 0
-_NEARER = 0.7  # a round must lower the errors to this share, or it is the last
-_MEDIAN_NORM = 1.54  # of a 3-D normal distribution of unit variance
+_NEARER = 0.7  # a round must lower the errors to this share, otherwise it is the last
+_MEDIAN_NORM = 1.54  # median norm of a 3-D normal distribution of unit variance
 
 
 @dataclass(frozen=True)
 class Measured:
-    """Knowledge of a rig from rows that were measured, before a model is made of them.
+    """Knowledge of a rig from measured rows, before a model is made from them.
 
     Attributes:
-        knowledge: parameters and covariance of the fit, at the set-up in question; of the build tolerances where
-            `is_placed` is False.
-        at: what stands around the rig.
-        is_placed: whether the rows tell where the station stands.
-        lacking: scale of the errors of joints that the model is known to leave, as `joint_error_scale` gives it.
-        fixes: of a prism at a standstill, on average.
+        knowledge: parameters and covariance of the fit, at the set-up in question. Where `is_placed` is False, the base
+            is assumed and has its prior covariance; without any rows, all is from build tolerances.
+        at: station and floor.
+        is_placed: True if the rows determine the station's place.
+        lacking: size of the joint errors that the model is known to lack, as returned by `joint_error_scale`.
+        fixes: average number of fixes of a prism at a standstill.
     """
 
     knowledge: Knowledge
@@ -65,16 +65,16 @@ class Measured:
 
     @cached_property
     def volume(self) -> Floats:
-        """(v, joints) poses of the work volume, always the same."""
+        """(v, joints) poses of the work volume, drawn with a fixed seed."""
         return work_volume(self.knowledge, self.at, np.random.default_rng(_SEED), VOLUME)
 
     def accuracy(self, root: Floats | None = None) -> ExpectedAccuracy:
-        """Expected accuracy over the work volume; `root` of the covariance where it is another than that of now."""
+        """Expected accuracy over the work volume; `root` replaces the root of the present covariance if given."""
         root = self.knowledge.root if root is None else root
         return predicted_accuracy(self.knowledge, root, self.volume, joint_error_scale=self.lacking)
 
     def after(self, readings: Floats, prism: str) -> Floats:
-        """Root of the covariance once a prism is measured in more poses (n, joints)."""
+        """Root of the covariance after a prism is measured in further poses (n, joints)."""
         seen = np.zeros((len(readings), len(self.rig.prisms)), dtype=bool)
         seen[:, self.rig.prism_names.index(prism)] = True
         poses = Candidates(readings, {"fixes": np.full(len(readings), self.fixes)}, seen)
@@ -83,19 +83,19 @@ class Measured:
 
 
 def from_rows(rig: Rig, observations: Observations | None, setup: str, *, lacking: float = 0.0) -> Measured:
-    """Say what rows tell of a rig and of a station's place.
+    """Estimate a rig's parameters and the station's place from measured rows.
 
-    Before the set-up has enough poses, the rows of others tell of the machine, and the station is assumed where it sees
-    most.
+    Until the set-up has enough poses, the rows of other set-ups determine the machine, and the station is assumed to
+    stand where it sees most.
 
     Args:
         rig: the rig description.
-        observations: rows measured so far, at any set-ups; None where there are none.
-        setup: the set-up whose station measures now.
+        observations: rows measured so far, at any set-ups; None if there are none.
+        setup: the present set-up.
         lacking: as in `Measured`.
 
     Raises:
-        UnsafeError: rows that cannot place a base (all on a line).
+        UnsafeError: the rows cannot determine the base (all positions on a line).
     """
     placed = [] if observations is None else _placed(observations)
     if observations is None or not placed:
@@ -123,11 +123,11 @@ def from_rows(rig: Rig, observations: Observations | None, setup: str, *, lackin
 
 
 def _fit_all_prisms(chain: Chain, samples: Samples, x: Floats) -> Fit:
-    """Fit from the nominal model, no prism left out.
+    """Fit from the nominal model without rejecting any prism as a whole.
 
-    A prism that is measured next lies centimetres off in its first poses, beside many of another that fit within
-    millimetres: the refinement would take all of them for outliers, for good. The noise is first held at what the worst
-    prism leaves, and lowered as the model comes nearer to it.
+    The first poses of a new prism may be off by centimetres, while many poses of an earlier prism fit within
+    millimetres. The refinement alone would reject all fixes of the new prism as outliers permanently. Therefore the
+    noise is first set to the error of the worst prism, and lowered as the fit improves.
     """
     noise_mm = math.inf
     while (worst_mm := _worst_prism_mm(chain, samples, x)) < _NEARER * noise_mm:
@@ -137,14 +137,14 @@ def _fit_all_prisms(chain: Chain, samples: Samples, x: Floats) -> Fit:
 
 
 def _worst_prism_mm(chain: Chain, samples: Samples, x: Floats) -> float:
-    """Return the standard deviation an axis of the prism that fits worst, by the median of its errors."""
+    """Return the standard deviation per axis of the worst prism, from the median of its errors."""
     error_mm = np.linalg.norm(chain.positions_mm(x, samples.data) - samples.position_mm, axis=1)
     prism = samples.data.prism
     return max(float(np.median(error_mm[prism == one])) for one in np.unique(prism)) / _MEDIAN_NORM
 
 
 def _placed(observations: Observations) -> list[str]:
-    """Set-ups with enough poses to tell where their station stands."""
+    """Return the set-ups with enough poses to determine the station's place."""
     setups = np.unique(observations.setup).tolist()
     return [s for s in setups if len(_standstills(observations.select(observations.setup == s))) >= LEAST_POSES]
 
@@ -154,16 +154,16 @@ def _standstills(observations: Observations) -> set[tuple[str, str, str]]:
 
 
 def chosen_poses(measured: Measured, prism: str, count: int, seed: int) -> Floats:
-    """Choose poses that lower the expected error over the work volume most, the most telling ones first.
+    """Choose poses that lower the expected error over the work volume most, the most informative first.
 
     Args:
-        measured: what is known.
-        prism: the one to measure; it is in view in all poses.
-        count: how many poses.
-        seed: of the candidates.
+        measured: knowledge from the rows so far.
+        prism: the prism to measure; it is in view in all poses.
+        count: number of poses.
+        seed: random seed of the candidates.
 
     Returns:
-        (n, joints) poses, n <= count, each ten in the order of a short motion.
+        (n, joints) poses, n <= count; every ten in turn are ordered for short motion.
     """
     rng = np.random.default_rng([_SEED, seed])
     knowledge, at = measured.knowledge, measured.at
@@ -183,7 +183,17 @@ def chosen_poses(measured: Measured, prism: str, count: int, seed: int) -> Float
 
 
 def random_poses(measured: Measured, prism: str, count: int, seed: int) -> Floats:
-    """Draw poses (n, joints), n <= count, evenly among those in which a prism is in view."""
+    """Draw poses uniformly among those in which a prism is in view.
+
+    Args:
+        measured: knowledge from the rows so far.
+        prism: the prism to measure.
+        count: number of poses.
+        seed: random seed.
+
+    Returns:
+        (n, joints) poses, n <= count, deg or mm.
+    """
     knowledge = measured.knowledge
     drawn = work_volume(knowledge, measured.at, np.random.default_rng([_SEED, 1, seed]), 20 * count)
     seen = in_view(Bodies.of(knowledge.chain, knowledge.x, drawn), measured.at)
@@ -192,19 +202,24 @@ def random_poses(measured: Measured, prism: str, count: int, seed: int) -> Float
 
 
 def reached(rig: Rig, readings: Floats) -> dict[str, tuple[float, float]]:
-    """Joint -> lowest and highest reading of poses (n, joints), n > 0."""
+    """Return joint -> lowest and highest reading in poses (n, joints), n > 0."""
     low, high = readings.min(axis=0), readings.max(axis=0)
     return {name: (float(low[i]), float(high[i])) for i, name in enumerate(rig.joint_names)}
 
 
 def volume_share(volume: Floats, ranges: Mapping[str, tuple[float, float]]) -> float:
-    """Share of the work volume's poses (v, joints) that lie inside all ranges, given in the order of the joints."""
+    """Return the share of the work volume's poses inside all ranges.
+
+    Args:
+        volume: (v, joints) poses of the work volume, deg or mm.
+        ranges: joint -> lowest and highest value, in the order of the joints.
+    """
     edges = np.array(list(ranges.values()))
     inside = ((volume >= edges[:, 0]) & (volume <= edges[:, 1])).all(axis=1)
     return float(inside.mean())
 
 
 def rms_mm(accuracy: ExpectedAccuracy, prisms: tuple[str, ...]) -> float:
-    """Expected RMS 3-D error over the work volume of some of the prisms."""
+    """Return the expected RMS 3-D error of some prisms over the work volume."""
     which = [accuracy.rig.prism_names.index(prism) for prism in prisms]
     return math.sqrt(float(np.mean(accuracy.rms_3d_mm[:, which] ** 2)))

@@ -30,9 +30,9 @@ class Knowledge:
     Attributes:
         chain, x: kinematics and its parameters (p,).
         setup: index of the set-up at which the poses will be measured.
-        root: (p + k, p + k) covariance of the parameters and of the coefficients of effects = root @ root'.
-        excess_variance: mm^2 per axis that fixes scatter beyond station and readings.
-        effects: named physics that the model has, k coefficients.
+        root: (p + k, p + k) root of the covariance of parameters and effect coefficients, root @ root'.
+        excess_variance: variance of the fixes beyond that of station and readings, mm^2 per axis.
+        effects: effects of the model, with k coefficients in total.
     """
 
     chain: Chain
@@ -44,24 +44,24 @@ class Knowledge:
 
     @classmethod
     def of_rig(cls, chain: Chain) -> Knowledge:
-        """Knowledge by build tolerances alone, at the first set-up of the chain."""
+        """Return the knowledge from build tolerances alone, at the first set-up of the chain."""
         return cls(chain, np.zeros(len(chain)), 0, np.diag(prior_precision(chain, 1.0) ** -0.5))
 
     @classmethod
     def before(cls, model: CalibratedModel, setup: int) -> Knowledge:
-        """Knowledge before the data of a calibration, with its noise; linearised at the calibrated model."""
+        """Return the prior knowledge of a calibrated model, linearised at its solution and with its noise."""
         effects = [c.prior_sigma for effect in model.effects for c in effect.coefficients]
         sigma = np.append(prior_precision(model.chain, model.prior_scale) ** -0.5, effects)
         return replace(cls.of_model(model, setup), root=np.diag(sigma))
 
     @classmethod
     def of_model(cls, model: CalibratedModel, setup: int) -> Knowledge:
-        """Knowledge after a calibration, at one of its set-ups."""
+        """Return the knowledge after a calibration, at one of its set-ups."""
         excess = model.excess_sigma_mm**2 + model.repeat_sigma_mm**2
         return cls(model.chain, model.values, setup, root_of(model.covariance), excess, model.effects)
 
     def at_new_setup(self, chain: Chain) -> Knowledge:
-        """Return the knowledge of this machine before a station at a new set-up, about whose base nothing is known."""
+        """Return the knowledge of this machine at a new set-up, whose base has only its prior covariance."""
         body, p = self.chain.base_start, len(self.chain)
         kept = np.r_[:body, p : len(self.root)]
         covariance = np.diag(np.append(prior_precision(chain, 1.0) ** -1.0, np.zeros(len(kept) - body)))
@@ -72,7 +72,7 @@ class Knowledge:
 
     @property
     def parameters(self) -> int:
-        """Number of parameters that the set-up's fixes can show: the machine's, and those of its own base."""
+        """Number of parameters on which the set-up's fixes depend: those of the machine and of the set-up's base."""
         return len(self.chain) - _BASE * (len(self.chain.setups) - 1)
 
     def without(self, names: Collection[str]) -> Knowledge:
@@ -94,31 +94,35 @@ class Knowledge:
 
         Args:
             readings: (n, joints) deg or mm.
-            conditions: under which the poses are taken, (n,) each; nothing is known of them by default.
+            conditions: conditions of the poses, (n,) each; unknown by default.
 
         Returns:
-            Of n * prisms fixes, prism by prism in each pose; its Jacobian is by parameters and coefficients, p + k.
+            The linearisation of n * prisms fixes, ordered by pose and then by prism. Its Jacobian has p + k columns:
+            parameters, then coefficients.
         """
         context = self.context(readings, conditions)
         columns = self._applied.columns(context)
         return columns.linearise(lambda data: self.chain.linearise(self.x, data), context.data, self._applied.values)
 
     def unknown_variance(self, readings: Floats, conditions: Conditions | None = None) -> Floats:
-        """(n * prisms, joints) variance of the joints' values by effects that lack what they need, deg^2 or mm^2.
+        """(n * prisms, joints) variance of joint values due to effects whose inputs are missing, deg^2 or mm^2.
 
         Arguments as for `linearise`.
         """
         return self._applied.unknown_variance(self.context(readings, conditions))
 
     def unknown_mm2(self, readings: Floats, conditions: Conditions | None = None) -> Floats:
-        """(n * prisms,) variance of each coordinate by effects that move the prism and lack what they need, mm^2.
+        """(n * prisms,) variance per coordinate due to effects that move the prism and whose inputs are missing, mm^2.
 
         Arguments as for `linearise`.
         """
         return self._applied.unknown_mm2(self.context(readings, conditions))
 
     def context(self, readings: Floats, conditions: Conditions | None = None) -> EffectContext:
-        """Poses (n, joints) as effects see them: a row for every prism in each, not measured yet."""
+        """Return the effect context of poses: one row without a measurement for each pose and prism.
+
+        Arguments as for `linearise`.
+        """
         rig = self.chain.rig
         n, prisms = len(readings), len(rig.prisms)
         rows = n * prisms
@@ -143,10 +147,14 @@ class Knowledge:
 
 
 def setup_of(model: CalibratedModel, name: str | None = None) -> int:
-    """Index of one of the model's set-ups: the one called `name`, or else the one whose base is known best.
+    """Return the index of a set-up of a model.
+
+    Args:
+        model: the model.
+        name: name of the set-up; by default the set-up whose base is known best.
 
     Raises:
-        UnsafeError: none is called so.
+        UnsafeError: the model has no set-up of this name.
     """
     setups = model.chain.setups
     if name is None:

@@ -1,4 +1,4 @@
-"""Pose plan of the command line: the poses that add most to what is known, and the accuracy they will bring."""
+"""Pose plan of the command line: the most informative poses, and the accuracy expected from them."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from calibration.observations import Floats
 from calibration.rig.description import Rig
 from calibration.run_settings import DEFAULT_RUN, Run
 
-_COVERED = 0.8  # of a joint's range
-_SHARE = 0.03  # of the expected variance
+_COVERED = 0.8  # share of a joint's range below which its coverage is reported
+_SHARE = 0.03  # share of the expected variance from which on a parameter is reported
 _NAMED = 3
 _CERTAIN_SIGMA = 5.0
 _DIGITS = 2
@@ -34,11 +34,11 @@ class PoseRow:
     """One pose of a plan.
 
     Attributes:
-        pose: from 1.
+        pose: number of the pose, from 1.
         joints: column of each joint -> value, deg or mm.
-        conditions: column of each condition that matters -> value; -1 or 1 for a direction of approach; `fixes`, how
-            many to take of each prism, where more than one.
-        prisms: in view.
+        conditions: column of each condition that matters -> value: -1 or 1 for a direction of approach; for `fixes` the
+            number of fixes of each prism.
+        prisms: prisms in view.
     """
 
     pose: int
@@ -47,22 +47,22 @@ class PoseRow:
     prisms: tuple[str, ...]
 
     def as_dict(self) -> dict[str, object]:
-        """`pose`, a column for each joint, one for each condition that matters (`<joint>_dir` ...), `prisms`."""
+        """Return a JSON object: `pose`, each joint and each condition (`<joint>_dir` ...) by column, `prisms`."""
         return {"pose": self.pose, **self.joints, **self.conditions, "prisms": list(self.prisms)}
 
 
 @dataclass(frozen=True)
 class PosePlan:
-    """Poses to measure and the accuracy they bring.
+    """Poses to measure and the expected accuracy.
 
     Attributes:
         rig: the rig description.
         plan: the poses.
-        at: what stands around the rig.
-        station: where the station's place is from, a sentence.
-        before: accuracy expected of the model as it is; None where only the rig file is known.
-        after: accuracy expected of the model once the poses are measured.
-        advice: what the conditions ask for, what is poorly known and what the poses bring; sentences.
+        at: station and floor.
+        station: a sentence with the station's place and its origin.
+        before: expected accuracy of the present model; None without a model.
+        after: expected accuracy of the model once the poses are measured.
+        advice: sentences with instructions for the conditions, poorly known parameters and the expected improvement.
         warnings: sentences.
     """
 
@@ -80,7 +80,7 @@ class PosePlan:
         """Assumptions of the plan, in sentences."""
         if self.before is not None:
             return (self.station, *self.at.rules)
-        lacks = "expected error: of a model that lacks nothing, with the noise that the rig file gives"
+        lacks = "expected error: for a model that lacks no effects, with the noise that the rig file gives"
         return (self.station, *self.at.rules, lacks)
 
     @cached_property
@@ -89,7 +89,7 @@ class PosePlan:
         return pose_rows(self.rig, self.plan.poses)
 
     def as_dict(self) -> dict[str, object]:
-        """The JSON object of `rigcal plan`."""
+        """Return the JSON object of `rigcal plan`."""
         return {
             "rig": self.rig.name,
             "poses": [row.as_dict() for row in self.rows],
@@ -109,7 +109,7 @@ class PosePlan:
 
 
 def pose_rows(rig: Rig, poses: Candidates) -> tuple[PoseRow, ...]:
-    """Poses as they are printed."""
+    """Return the rows of a pose table, rounded for printing."""
     conditions = {name: values.round(_DIGITS).tolist() for name, values in poses.conditions.items()}
     return tuple(
         PoseRow(
@@ -136,27 +136,27 @@ def plan_poses(
     separate: Sequence[str] = (),
     run: Run = DEFAULT_RUN,
 ) -> PosePlan:
-    """Plan the poses of a first session, or of one after a calibration.
+    """Plan the poses of a first session, or of a session after a calibration.
 
-    Without a model the poses make the parameters best determined; with one they lower most what it is expected to err
-    over the work volume; with `separate` they tell effects apart.
+    Without a model, the poses determine the parameters best. With a model, they minimise its expected error over the
+    work volume. With `separate`, they distinguish effects.
 
     Args:
         rig: the rig description.
-        poses: how many.
-        model: what is known already. At one of its set-ups the poses will be measured, unless `station_mm` is given.
+        poses: number of poses.
+        model: a calibrated model. The poses will be measured at one of its set-ups, unless `station_mm` is given.
         station_mm: (3,) place of a new station set-up in the base frame.
-        setup: which of the model's set-ups; by default the one whose base is known best.
-        floor_mm: height of the floor over the base's origin.
-        separate: two effects or more, each the `family@where` of one in the library.
-        run: seed of candidates and work volume, and progress.
+        setup: the model's set-up to measure at; by default the one whose base is known best.
+        floor_mm: height of the floor above the base's origin.
+        separate: two or more effects of the library, each as `family@where`.
+        run: random seed of candidates and work volume, and the progress callback.
 
     Returns:
-        The poses in the order to measure them, with the accuracy before and after.
+        The poses in the order of measurement, with the expected accuracy before and after.
 
     Raises:
-        DataError: fewer reachable poses than asked for; an effect that poses do not show.
-        UnsafeError: a model of another rig, or without that set-up; no reachable pose in view.
+        DataError: fewer reachable poses than requested; an effect that is not visible in any pose.
+        UnsafeError: the model is of a different rig, or lacks that set-up; no reachable pose is in view.
     """
     rng, report = np.random.default_rng(run.seed), run.progress
     if model is not None:
@@ -184,26 +184,26 @@ def plan_poses(
 
 
 def _require_same(rig: Rig, of_model: Rig) -> None:
-    """UnsafeError unless the rigs are one; what they carry on their buses, and how, plays no part in a plan."""
+    """Raise UnsafeError unless the rigs are equal, apart from their channels and the decoding of bus messages."""
     if of_model.name != rig.name:
         raise UnsafeError(f"the model is of rig {of_model.name!r}, not of {rig.name!r}; name its own rig")
     differ = [key for key in rig.differences(of_model) if key not in ("channels", "decoding")]
     if differ:
         raise UnsafeError(
-            f"rig {rig.name!r} differs from the one that the model was calibrated with, in its {', '.join(differ)}; "
-            f"plan with that rig file, or calibrate anew with this one"
+            f"rig {rig.name!r} differs from the rig that the model was calibrated with, in {', '.join(differ)}; "
+            f"plan with that rig file, or calibrate again with this one"
         )
 
 
 def _surroundings(
     rig: Rig, present: Knowledge | None, station_mm: Floats | None, floor_mm: float | None
 ) -> tuple[Knowledge, Site, str]:
-    """Knowledge and surroundings at the poses to be measured, and a sentence about the station's place."""
+    """Return the knowledge and site for the poses to be measured, and a sentence about the station's place."""
     if present is not None and station_mm is None:
         at = site(present.chain, present.x, setup=present.setup, floor_mm=floor_mm)
         label = f"set-up {name!r}" if (name := present.chain.setups[present.setup]) else "the set-up"
         others = "; choose another with --setup NAME" if len(present.chain.setups) > 1 else ""
-        return present, at, f"station: where {label} of the model has it, {_place(at)}{others}"
+        return present, at, f"station: as in {label} of the model, {_place(at)}{others}"
     blank = Chain(rig, {"": Placement.identity()})
     x = np.zeros(len(blank))
     if present is not None:
@@ -233,7 +233,7 @@ def _advice(
     if moved:
         yield (
             f"these {len(poses)} poses would leave an expected error of {after.rms_mm:.3g} mm RMS over the work volume "
-            f"at the new set-up; at its own the model's is {before.rms_mm:.3g} mm"
+            f"at the new set-up; at the model's own set-up it is {before.rms_mm:.3g} mm"
         )
     else:
         yield (
@@ -243,8 +243,8 @@ def _advice(
     yield f"the present model's expected error is {before.where}"
     if after.lacking_mm > 0.5 * after.rms_mm:
         yield (
-            f"{after.lacking_mm:.3g} mm of it is what the model lacks, which more poses do not lower; look for an "
-            f"effect or train a residual"
+            f"{after.lacking_mm:.3g} mm of it is due to effects that the model lacks, which more poses do not lower; "
+            f"look for an effect or train a residual"
         )
     yield from _poorly_known(present, before.readings)
     rig = model.rig
@@ -254,7 +254,7 @@ def _advice(
             beyond = int(((poses.readings[:, index] < low) | (poses.readings[:, index] > high)).sum())
             yield (
                 f"{joint.name} was measured only at {low:.0f} .. {high:.0f} of its {joint.limits[0]:g} .. "
-                f"{joint.limits[1]:g} {joint.unit}; {beyond} of these poses go beyond"
+                f"{joint.limits[1]:g} {joint.unit}; {beyond} of these poses go beyond this range"
             )
     for prism, name in enumerate(rig.prism_names):
         if not model.coverage.fixes.get(name):
@@ -262,9 +262,9 @@ def _advice(
 
 
 def _poorly_known(knowledge: Knowledge, volume: Floats) -> Iterator[str]:
-    """The parameters whose exact knowledge would lower the expected variance tr(B C) most.
+    """Yield a sentence with the parameters whose exact knowledge would lower the expected variance tr(B C) most.
 
-    Knowing parameter i takes (C B C)_ii / C_ii off it, what others share with it included.
+    Knowing parameter i exactly lowers it by (C B C)_ii / C_ii, including the effect through correlated parameters.
     """
     root, by_volume = knowledge.root, volume_root(knowledge, volume)
     variance = (root**2).sum(axis=1)
@@ -277,13 +277,13 @@ def _poorly_known(knowledge: Knowledge, volume: Floats) -> Iterator[str]:
             size = f"{math.degrees(sigma):.2g} deg" if parameter.unit == "rad" else f"{sigma:.2g} mm"
             sizes.append(f"{parameter.name} (+-{size}, {share[i]:.0%})")
     if sizes:
-        yield f"poorly known for what they do, with their share of the expected variance: {', '.join(sizes)}"
+        yield f"poorly known parameters, with their share of the expected variance: {', '.join(sizes)}"
 
 
 def _warnings(rig: Rig, chosen: Plan, model: CalibratedModel | None) -> Iterator[str]:
     fixes, needed = chosen.poses.fixes_in_all, math.ceil(chosen.parameters / 3)
     if model is None and fixes < needed:
-        yield f"{fixes} fixes are too few: to calibrate, {chosen.parameters} parameters need at least {needed}"
+        yield f"{fixes} fixes are too few: calibrating {chosen.parameters} parameters needs at least {needed}"
     for prism, name in enumerate(rig.prism_names):
         if not chosen.poses.seen[:, prism].any():
             yield f"prism {name} is in view in none of the poses"
@@ -291,5 +291,5 @@ def _warnings(rig: Rig, chosen: Plan, model: CalibratedModel | None) -> Iterator
         if sigma < _CERTAIN_SIGMA:
             yield (
                 f"{effect} of plausible size would stand out from the others by {sigma:.1f} sigma only: plan more "
-                f"poses, or look for another experiment"
+                f"poses, or choose a different experiment"
             )

@@ -1,8 +1,8 @@
-"""Choice of the poses that determine a model best, or tell effects apart, among candidates.
+"""Choice among candidate poses of those that determine a model best, or distinguish effects.
 
-A pose brings the fixes of all prisms in view. They share the errors of the joints' readings, so their covariance is
-Sigma_station + J_q Sigma_q J_q' with the second part common to them; what is known beforehand are the build tolerances,
-or a model's covariance. With such a prior a redundant parameter is no obstacle: no pose changes it.
+A pose gives the fixes of all prisms in view. They share the errors of the joint readings, so their covariance is
+Sigma_station + J_q Sigma_q J_q', where the second part correlates them. The prior is given by the build tolerances, or
+by a model's covariance. With such a prior, redundant parameters are harmless: no pose changes their covariance.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from calibration.design.alternatives import (
     name_of,
 )
 from calibration.design.candidates import Candidates
-from calibration.design.conditions import one_after_another
+from calibration.design.conditions import with_distinct_times
 from calibration.design.exchange import (
     Accuracy,
     Criterion,
@@ -50,25 +50,25 @@ from calibration.kinematics.chain import Linearisation
 from calibration.numerics.matrices import root_of
 from calibration.observations import Floats, Observations
 
-_MOVES = 20  # of each pose; as many again would bring a hundredth more of the log odds
+_MOVES = 20  # exchange rounds with neighbours; twice as many would raise the log odds by about 1 %
 _SEEN = 0.1  # as in identifiability: the data alone determine a direction within ten prior sigmas
 _LINEARISED_AT_ONCE = 2000
 
 
 @dataclass(frozen=True)
 class Plan:
-    """Poses to measure, in the order of a short motion; of a long one where an effect in question grows with travel.
+    """Poses to measure, ordered for short motion; for long motion where an effect in question grows with travel.
 
     Attributes:
-        poses: what to drive to, under which conditions where these matter, and what is in view there.
-        seconds_of_motion: from the first to the last, every joint at its full rate.
-        parameters: number that the set-up can show.
-        determined: number of directions of them that the poses alone determine.
+        poses: the poses, the conditions that matter, and the prisms in view.
+        seconds_of_motion: duration from the first to the last pose, with every joint at its full rate.
+        parameters: number of parameters on which the set-up's fixes depend.
+        determined: number of parameter directions that the poses alone determine.
         observability: `O1` .. `O5` of the poses alone.
-        root: (p + k, p + k) covariance of parameters and coefficients after the poses = root @ root'.
-        stands_out: `family@where` of the effects to be told apart -> by how many sigma one of plausible size, or of the
-            size found, stands out in these poses from what the most alike of the others can explain: half the square
-            are the log odds that they are expected to bring, if it is there.
+        root: (p + k, p + k) root of the covariance of parameters and coefficients after the poses, root @ root'.
+        stands_out: `family@where` of each effect to distinguish -> number of sigma by which it stands out from the best
+            explanation by the most similar other effect, at its plausible or fitted size. Half the square is the log
+            odds that the poses are expected to bring, if the effect exists.
     """
 
     poses: Candidates
@@ -93,22 +93,23 @@ def plan(
     """Choose poses among candidates.
 
     Args:
-        knowledge: of the rig.
-        candidates: at least `count` of them.
-        count: how many poses.
-        volume: (v, joints) poses of the work volume: choose for the accuracy of predictions there (V-optimal) and not
-            for the parameters (D-optimal).
-        separate: effects, each the `family@where` of one in the library, of plausible size, or one as it was found, and
-            after it others that would be the same answer: choose to tell each from the others, one of them being there
-            and none known yet.
-        measured: rows that were measured already and are no part of what is known.
-        nearby: as `near` without its first arguments; the poses chosen move to better ones near them, time and again.
+        knowledge: knowledge of the rig.
+        candidates: at least `count` candidate poses.
+        count: number of poses.
+        volume: (v, joints) poses of the work volume. If given, optimise the accuracy of predictions there (V-optimal)
+            instead of the parameters (D-optimal).
+        separate: effects to distinguish, assuming that one of them exists and none is in the knowledge. Each is either
+            the `family@where` of an effect in the library, at its plausible size, or a sequence of a fitted effect
+            followed by others that count as the same answer.
+        measured: rows that were measured already but are not part of `knowledge`.
+        nearby: `near` with all arguments bound but the poses. If given, the chosen poses move repeatedly to better
+            neighbours.
 
     Raises:
-        DataError: fewer candidates than poses; an effect that no choice of poses shows.
+        DataError: fewer candidates than poses; an effect that is not visible in any pose.
     """
     if len(candidates) < count:
-        raise DataError("poses", f"only {len(candidates)} reachable poses in view were found, {count} are asked for")
+        raise DataError("poses", f"only {len(candidates)} reachable poses in view were found, {count} are requested")
     rig = knowledge.chain.rig
     answers: list[Sequence[str | FittedEffect]] = [[one] if isinstance(one, str) else one for one in separate]
     effects = [effect for answer in answers for effect in answer]
@@ -117,32 +118,32 @@ def plan(
     candidates = _under_conditions_that_matter(knowledge, before, candidates, effects)
     with threadpool_limits(1, user_api="blas"):  # the blocks are small: threads would wait for each other
         alternatives = tuple(alternative_of(before, e, candidates.readings, candidates.conditions) for e in effects)
-        told = None if measured is None else _told(before, measured, alternatives)
+        known_information = None if measured is None else _measured_information(before, measured, alternatives)
         blocks = whitened(before, candidates, alternatives)
         criterion: Criterion = Determinant()
         if alternatives:
-            nothing = information_of(blocks[:0], told)
+            nothing = information_of(blocks[:0], known_information)
             pairs = _pairs([len(answer) for answer in answers])
             hypotheses = _hypotheses(known, alternatives, nothing)
             criterion = Discrimination(hypotheses if len(answers) == 1 else hypotheses[:-1], nothing, pairs)
         elif volume is not None:
             criterion = Accuracy(volume_root(knowledge, volume))
         in_view = np.repeat(candidates.seen.any(axis=0), 3)
-        chosen = candidates.select(choose(blocks[:, in_view], count, criterion, told))
+        chosen = candidates.select(choose(blocks[:, in_view], count, criterion, known_information))
         if nearby is not None:
             for _ in range(_MOVES):
                 closer, number = nearby(chosen)
                 chosen = closer.select(
-                    improve(whitened(before, closer, alternatives)[:, in_view], number, criterion, told)
+                    improve(whitened(before, closer, alternatives)[:, in_view], number, criterion, known_information)
                 )
         seconds = travel_s(rig, chosen.readings)
         order = ordered(rig, seconds, chosen, [name_of(effect) for effect in effects])
         poses = chosen.select(order)
-        poses = replace(poses, conditions=one_after_another(poses.conditions))
+        poses = replace(poses, conditions=with_distinct_times(poses.conditions))
         stands_out: dict[str, float] = {}
         if isinstance(criterion, Discrimination):
-            # Once more in their order: some effects depend on what was before.
-            log_odds = criterion.log_odds(information_of(whitened(before, poses, alternatives), told))
+            # Recomputed in the final order, as some effects depend on the preceding poses.
+            log_odds = criterion.log_odds(information_of(whitened(before, poses, alternatives), known_information))
             stands_out = _stands_out(alternatives, criterion.pairs, log_odds)
         after = covariance_of(whitened(knowledge, poses))
         alone = _alone(knowledge, poses)
@@ -163,8 +164,8 @@ def _under_conditions_that_matter(
 ) -> Candidates:
     """Keep the conditions that matter.
 
-    They are those that effects to be told apart need, varied only where that changes any of them, and those that change
-    some of the effects and leave others.
+    These are the conditions that the effects to distinguish need as inputs, held constant where they change none of the
+    effects; and the conditions that change some of the effects but not all.
     """
     matters = _sides(knowledge, candidates)
     if not separate:
@@ -184,7 +185,7 @@ def _under_conditions_that_matter(
 def _pairs(members: Sequence[int]) -> tuple[tuple[int, int], ...]:
     """Pair the first member of every answer with all members of the other answers.
 
-    One answer alone is paired with no effect at all, which comes last.
+    A single answer is paired with the hypothesis of no effect, which comes last.
     """
     first = [sum(members[:number]) for number in range(len(members))]
     if len(members) == 1:
@@ -201,22 +202,22 @@ def _pairs(members: Sequence[int]) -> tuple[tuple[int, int], ...]:
 def _stands_out(
     alternatives: Sequence[Alternative], pairs: Sequence[tuple[int, int]], log_odds: Floats
 ) -> dict[str, float]:
-    """Return the sigma by which each effect stands out from the most alike of the others, by its name."""
+    """Return effect name -> the number of sigma by which it stands out from the most similar other effect."""
     least: dict[int, float] = {}
     for odds, (true, _) in zip(log_odds.tolist(), pairs, strict=True):
         least[true] = min(odds, least.get(true, math.inf))
-    # The hypothesis of no effect at all comes last and has no name.
+    # The hypothesis of no effect comes last and has no name.
     named = {alternatives[true].name: odds for true, odds in least.items() if true < len(alternatives)}
     return {name: math.sqrt(2.0 * max(0.0, odds)) for name, odds in named.items()}
 
 
 def _hypotheses(known: int, alternatives: Sequence[Alternative], before: Floats) -> tuple[Hypothesis, ...]:
-    """Each effect by itself beside the kinematics, and last the kinematics alone.
+    """Return a hypothesis for each effect together with the kinematics, and last one for the kinematics alone.
 
     Args:
-        known: how many parameters and coefficients there are beside those of the alternatives.
+        known: number of parameters and coefficients without those of the alternatives.
         alternatives: the effects.
-        before: (q, q) information of the prior and of what was measured already.
+        before: (q, q) information of the prior and of earlier measurements.
     """
     kinematics, found = np.arange(known), list[Hypothesis]()
     first = known
@@ -225,19 +226,24 @@ def _hypotheses(known: int, alternatives: Sequence[Alternative], before: Floats)
         first += alternative.size
         mean = np.zeros(len(before))
         mean[own] = alternative.found
-        # Beside it, the kinematics explain the rest of what was measured.
+        # Given the effect, the kinematics explain the rest of the measurements.
         mean[:known] = -np.linalg.solve(before[:known, :known], before[:known, own] @ alternative.found)
         found.append(Hypothesis(mean, np.concatenate([kinematics, own])))
     return (*found, Hypothesis(np.zeros(len(before)), kinematics))
 
 
 def whitened(knowledge: Knowledge, candidates: Candidates, alternatives: tuple[Alternative, ...] = ()) -> Floats:
-    """(n, 3 prisms, p + k) Jacobian of each pose's fixes in their sigmas, the parameters in prior units.
+    """(n, 3 prisms, p + k) whitened Jacobian of each pose's fixes, with parameters in prior units.
 
-    Rows of prisms out of view are zero. The coefficients of `alternatives` come last.
+    Rows of prisms out of view are zero.
+
+    Args:
+        knowledge: linearisation point and prior covariance.
+        candidates: n poses.
+        alternatives: effects whose coefficients are the last columns.
     """
     prisms, known = len(knowledge.chain.rig.prisms), len(knowledge.root)
-    # Of all poses at once: an effect in one may depend on those before.
+    # For all poses at once, as an effect in one pose may depend on the preceding ones.
     columns = joined_columns(alternatives, knowledge.context(candidates.readings, candidates.conditions))
     total = known + len(columns)
     out = np.empty((len(candidates), 3 * prisms, total))
@@ -267,9 +273,10 @@ def volume_root(knowledge: Knowledge, volume: Floats) -> Floats:
 
 
 def _noise(knowledge: Knowledge, lin: Linearisation, poses: Candidates) -> Floats:
-    """(n, 3 prisms, 3 prisms) covariance of the fixes of each standstill; the readings' errors are common to them.
+    """(n, 3 prisms, 3 prisms) covariance of the fixes of each standstill.
 
-    So is what is unknown of the joints' values. On the move, every fix has its own error of the instant.
+    The errors of the readings and the unknown part of the joint values are common to the fixes of a pose. In motion,
+    every fix has its own timing error in addition.
     """
     rig, n = knowledge.chain.rig, len(poses)
     size = 3 * len(rig.prisms)
@@ -293,13 +300,15 @@ def _noise(knowledge: Knowledge, lin: Linearisation, poses: Candidates) -> Float
 
 
 def _alone(knowledge: Knowledge, poses: Candidates) -> Floats:
-    """Singular values of the Jacobian of the poses alone, each parameter in units of its build tolerance."""
+    """Return the singular values of the poses' whitened Jacobian, with parameters in units of build tolerance."""
     sigma = np.diag(prior_precision(knowledge.chain, 1.0) ** -0.5)
     rows = whitened(replace(knowledge, root=sigma, effects=()), poses)
     return np.asarray(np.linalg.svd(rows.reshape(-1, rows.shape[2]), compute_uv=False), dtype=np.float64)
 
 
-def _told(knowledge: Knowledge, measured: Observations, alternatives: tuple[Alternative, ...]) -> Floats:
+def _measured_information(
+    knowledge: Knowledge, measured: Observations, alternatives: tuple[Alternative, ...]
+) -> Floats:
     """(q, q) information of measured rows about parameters and coefficients, in prior units."""
     chain = knowledge.chain
     samples = averaged(chain, measured)
@@ -311,15 +320,15 @@ def _told(knowledge: Knowledge, measured: Observations, alternatives: tuple[Alte
     x[:known] = np.concatenate([knowledge.x, coefficient_values(knowledge.effects)])
     root = np.eye(total)
     root[:known, :known] = knowledge.root
-    said = information(chain, samples, x, excess_variance=knowledge.excess_variance, additions=additions)
-    in_units: Floats = root.T @ said @ root
+    added = information(chain, samples, x, excess_variance=knowledge.excess_variance, additions=additions)
+    in_units: Floats = root.T @ added @ root
     return in_units
 
 
 def _sides(knowledge: Knowledge, candidates: Candidates) -> set[str]:
-    """Directions of approach that effects of the model need."""
+    """Return the directions of approach that effects of the model need as inputs."""
     joints = knowledge.chain.rig.joint_names
     poses = candidates.select(np.arange(1)).under([f"{name}_dir" for name in joints])
-    blank = knowledge.unknown_variance(poses.readings)[0]
-    told = knowledge.unknown_variance(poses.readings, poses.conditions)[0]
-    return {f"{name}_dir" for name, more, less in zip(joints, blank, told, strict=True) if more > less}
+    without = knowledge.unknown_variance(poses.readings)[0]
+    given = knowledge.unknown_variance(poses.readings, poses.conditions)[0]
+    return {f"{name}_dir" for name, more, less in zip(joints, without, given, strict=True) if more > less}

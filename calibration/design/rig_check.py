@@ -14,12 +14,12 @@ from calibration.kinematics.chain import Chain, Placement
 from calibration.observations import Floats, Observations
 from calibration.rig.description import Rig
 
-_LEAST_MM = 10.0  # a machine has a longer link
-_TURN_RAD = 6.4  # limits of whole turns in rad
-_THICK = 0.25  # of the reach: no link is as wide
-_ROUNDED = 1e-3  # of a right angle: pi / 2 written with four digits
-POSES = 100  # at which the parameters are looked for
-_POSES_EACH = 2.0  # poses for each parameter where 100 are too few
+_LEAST_MM = 10.0  # every machine has a length above this
+_TURN_RAD = 6.4  # a whole turn in rad; smaller limits may be in rad
+_THICK = 0.25  # largest plausible radius of a link, as a share of the reach
+_ROUNDED = 1e-3  # tolerance in right angles, for pi / 2 written with four digits
+POSES = 100  # number of poses at which identifiability is evaluated
+_POSES_EACH = 2.0  # poses per parameter where 100 are too few
 
 
 @dataclass(frozen=True)
@@ -27,10 +27,10 @@ class LinkRadius:
     """The link of a row.
 
     Attributes:
-        row: its number.
-        length_mm: its mean length over the work volume.
-        radius_mm: what `plan` keeps clear of.
-        is_assumed: True where the row gives none.
+        row: number of the row.
+        length_mm: mean length of the link over the work volume.
+        radius_mm: radius that `plan` keeps clear around the link.
+        is_assumed: True if the row gives no radius.
     """
 
     row: int
@@ -41,17 +41,17 @@ class LinkRadius:
 
 @dataclass(frozen=True)
 class RigCheck:
-    """A rig as its file has it.
+    """Properties that follow from a rig file.
 
     Attributes:
         rig: the rig.
-        zero: in one pose, all joints at zero.
-        middle: in one pose, all joints in the middle of their limits.
+        zero: the machine with all joints at zero, one pose.
+        middle: the machine with all joints in the middle of their limits, one pose.
         at: floor, station and reach.
-        links: those that have a length.
+        links: the links that have a length.
         free_share: share of the poses inside the limits in which links touch neither each other nor the floor.
-        poses: how many poses `seen` is for.
-        seen: what fixes of all prisms in as many poses, spread evenly, show of the parameters.
+        poses: number of poses that `seen` is based on.
+        seen: identifiability of the parameters from fixes of all prisms in these poses, spread evenly.
     """
 
     rig: Rig
@@ -65,7 +65,7 @@ class RigCheck:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Sentences on what the file may have forgotten."""
+        """Sentences on values that may be missing or wrong in the file."""
         return tuple(self._warnings())
 
     def _warnings(self) -> Iterator[str]:
@@ -80,7 +80,7 @@ class RigCheck:
             if not link.is_assumed and link.radius_mm > _THICK * self.at.reach_mm:
                 yield (
                     f"radius_mm of row {link.row} is {link.radius_mm:g} mm, over a quarter of the reach: it is half "
-                    "the width of a link, and links that always touch are not kept clear of each other"
+                    "the width of a link, and links that always touch are not kept clear of each other; check it"
                 )
         outside = [j for j in self.rig.joints if not j.limits[0] <= 0.0 <= j.limits[1]]
         if outside:
@@ -124,7 +124,7 @@ class RigCheck:
 
 
 def _unit_warnings(rig: Rig) -> Iterator[str]:
-    """Yield sentences on numbers that would fit another unit than rig files have."""
+    """Yield sentences on numbers that suggest a wrong unit."""
     lengths = [abs(x) for row in rig.rows for x in (row.a_mm, row.d_mm, row.b_mm)]
     lengths += [abs(x) for row in rig.rows if row.before for x in (row.before.x_mm, row.before.y_mm, row.before.z_mm)]
     lengths += [abs(x) for joint in rig.joints if joint.kind == "prismatic" for x in joint.limits]
@@ -146,13 +146,13 @@ def _unit_warnings(rig: Rig) -> Iterator[str]:
 
 
 def check_rig(rig: Rig) -> RigCheck:
-    """Work out what a rig file amounts to.
+    """Compute the properties of a rig that its file implies.
 
     Args:
         rig: the rig.
 
     Raises:
-        CalibrationError: numbers that no machine has.
+        CalibrationError: the file has implausible numbers.
     """
     chain = Chain(rig, {"": Placement.identity()})
     x = np.zeros(len(chain))
@@ -176,7 +176,7 @@ def check_rig(rig: Rig) -> RigCheck:
 
 
 def _seen(rig: Rig, readings: Floats, at: Site) -> Identifiability:
-    """Look which parameters fixes of all prisms show, from the station of `at`."""
+    """Return the identifiability of the parameters from fixes of all prisms, measured from the station of `at`."""
     chain = Chain(rig, {"": placement(at)})
     n, prisms = len(readings), len(rig.prisms)
     rows = n * prisms

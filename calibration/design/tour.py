@@ -15,12 +15,12 @@ from calibration.observations import Floats
 from calibration.rig.description import Rig
 
 _ROUNDS = 20
-_WORK = 500  # poses times starts
-_LESS = 1e-9  # s; less is rounding
+_WORK = 500  # number of poses times number of starts
+_LESS = 1e-9  # s; smaller gains are rounding errors
 
 
 def travel_s(rig: Rig, readings: Floats) -> Floats:
-    """(n, n) seconds between poses (n, joints): all joints move at once, each at its `max_rate`."""
+    """(n, n) travel times between poses (n, joints), s; all joints move at once, each at its `max_rate`."""
     rate = np.array([joint.max_rate for joint in rig.joints])
     scaled = readings / rate
     seconds: Floats = np.abs(scaled[:, None, :] - scaled[None, :, :]).max(axis=2)
@@ -33,25 +33,34 @@ def length_s(seconds: Floats, order: Integers) -> float:
 
 
 def ordered(rig: Rig, seconds: Floats, poses: Candidates, separate: Sequence[str]) -> Integers:
-    """Order the poses (n,) for a short way, those under the same slow conditions together.
+    """Order poses for a short path, keeping poses with the same slow conditions together.
 
-    The way goes to and fro where one of the effects to be told apart grows with the path of its joint.
+    The path alternates between low and high values of a joint where an effect to distinguish grows with its travel.
+
+    Args:
+        rig: the rig description.
+        seconds: (n, n) travel times between the poses, s.
+        poses: the poses.
+        separate: effects to distinguish, `family@where`.
+
+    Returns:
+        (n,) indices of the poses.
     """
     names = slow(poses.conditions)
     levels = np.column_stack([np.zeros(len(poses)), *(poses.conditions[name] for name in names)])
     _, block = np.unique(levels, axis=0, return_inverse=True)
     parts = [np.flatnonzero(block == number) for number in range(block.max() + 1)]
     places = [effect.partition("@") for effect in separate]
-    travelling = [rig.joint_names.index(where) for name, _, where in places if library()[name].goes_by_travel]
+    travelling = [rig.joint_names.index(where) for name, _, where in places if library()[name].depends_on_travel]
     if travelling:
         low, high = limits(rig)
         share = ((poses.readings - low) / (high - low))[:, travelling].sum(axis=1)
-        return np.concatenate([own[_to_and_fro(share[own])] for own in parts])
+        return np.concatenate([own[_alternating(share[own])] for own in parts])
     return np.concatenate([own[short_tour(seconds[np.ix_(own, own)])] for own in parts])
 
 
-def _to_and_fro(values: Floats) -> Integers:
-    """(n,) the lower and the upper half of some values in turn."""
+def _alternating(values: Floats) -> Integers:
+    """(n,) indices that alternate between the lower and the upper half of some values."""
     rising = np.argsort(values, kind="stable")
     order = np.empty(len(values), dtype=np.intp)
     order[0::2], order[1::2] = np.split(rising, [(len(values) + 1) // 2])
@@ -59,7 +68,7 @@ def _to_and_fro(values: Floats) -> Integers:
 
 
 def short_tour(seconds: Floats) -> Integers:
-    """Find an order (n,) with a short way through (n, n) travel times; both ends are free."""
+    """Find an order (n,) with a short path through (n, n) travel times; both ends are free."""
     n = len(seconds)
     starts = np.unique(np.linspace(0, n - 1, max(1, min(n, _WORK // n))).astype(int))
     tours = [_two_opt(seconds, _nearest_neighbour(seconds, int(start))) for start in starts]
@@ -77,7 +86,7 @@ def _nearest_neighbour(seconds: Floats, start: int) -> Integers:
 
 
 def _two_opt(seconds: Floats, order: Integers) -> Integers:
-    """Reverse parts of the way while that shortens it; a step to or from nowhere takes no time."""
+    """Reverse sections of the path while that shortens it; the path is open, so its two ends cost nothing."""
     n = len(order)
     if n < 2:
         return order

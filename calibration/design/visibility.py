@@ -1,8 +1,8 @@
-"""Reachable poses and prisms in view of the station, by plain rules: links are capsules.
+"""Reachable poses and prisms in view of the station, with links modelled as capsules.
 
-A rig file knows frames and no shapes. So every link is the straight line between the origins of two frames that follow
-each other, with its row's `radius_mm`, or else an assumed 1.2 % of the reach, and a pedestal stands between the base
-and the floor. Everything here is in the base frame.
+A rig file gives frames but no shapes. Every link is therefore the straight line between the origins of two consecutive
+frames, with its row's `radius_mm`, or by default 1.2 % of the reach. A pedestal stands between the base and the floor.
+All coordinates are in the base frame.
 """
 
 from __future__ import annotations
@@ -21,19 +21,19 @@ from calibration.rig.description import Rig
 
 Flags = NDArray[np.bool_]
 
-NEAREST_MM = 1500.0  # a total station measures no prism nearer, and nobody puts one nearer to a boom that moves
+NEAREST_MM = 1500.0  # shortest range of a total station, and a safe distance from a moving boom
 FARTHEST_MM = 500_000.0
 STEEPEST_DEG = 60.0  # above and below the horizon
-_RADIUS = 0.012  # of the reach: half the width of a boom
-_FLOOR = 0.15  # of the reach, below the base
-_SURFACE = 0.7  # a prism stands on its link, which is no thicker than this share of its distance from the line
-_NEIGHBOURS = 2.0  # of two links' radii together, along the chain; nearer ones are joined by a bracket
-_BUILT_SO = 0.5  # share of poses; links closer than two radii in more of them are not as straight as drawn here
+_RADIUS = 0.012  # assumed radius of a link, half the width of a boom, as a share of the reach
+_FLOOR = 0.15  # assumed depth of the floor below the base, as a share of the reach
+_SURFACE = 0.7  # a prism is mounted on its link's surface: the radius is at most this share of its distance to the axis
+_NEIGHBOURS = 2.0  # links closer along the chain than this multiple of their summed radii are joined by a bracket
+_BY_DESIGN = 0.5  # links that touch in more than this share of poses touch by design, as they are not really straight
 _LEAST_LINK_MM = 1.0
 _SPREAD_POSES = 256
-_RING = 16  # places about the base that are tried for the station
-_DISTANCES = (0.4, 0.8, 1.2)  # of the reach
-_EYE_MM = 1600.0  # the instrument above the floor
+_RING = 16  # directions around the base that are tried for the station
+_DISTANCES = (0.4, 0.8, 1.2)  # distances that are tried for the station, as shares of the reach
+_EYE_MM = 1600.0  # height of the instrument above the floor
 
 
 @dataclass(frozen=True)
@@ -43,10 +43,10 @@ class Site:
     Attributes:
         station_mm: (3,) the instrument's centre.
         up: (3,) unit vector against gravity.
-        reach_mm: the farthest a frame or prism comes from the base.
-        floor_mm: height of the floor over the base's origin, along `up`.
-        radii_mm: (row number, radius) of the links whose rows give one.
-        apart: pairs of links that must not touch, by the numbers of their rows; 0 for the pedestal.
+        reach_mm: largest distance of a frame or prism from the base's origin.
+        floor_mm: height of the floor above the base's origin, along `up`.
+        radii_mm: (row number, radius) of the links whose rows give a radius.
+        apart: pairs of links that must not touch, by row number; 0 is the pedestal.
     """
 
     station_mm: Floats
@@ -58,23 +58,23 @@ class Site:
 
     @property
     def assumed_radius_mm(self) -> float:
-        """Radius of the pedestal and of the links whose rows give none."""
+        """Radius of the pedestal and of the links whose rows give no radius."""
         return _RADIUS * self.reach_mm
 
     def radius_mm(self, number: int) -> float:
-        """Return the radius of the link of a row, or of the pedestal, 0."""
+        """Return the radius of the link with a row number, or of the pedestal for 0."""
         return dict(self.radii_mm).get(number, self.assumed_radius_mm)
 
     @property
     def rules(self) -> tuple[str, ...]:
-        """The rules for reachable and in view, in sentences."""
+        """Sentences that define reachable and in view."""
         given = ", ".join(f"{radius:g} mm of row {number}" for number, radius in self.radii_mm)
         radii = f"an assumed radius of {self.assumed_radius_mm:.0f} mm{f', but {given}' if given else ''}"
         return (
-            f"reachable: inside the joint limits, nothing lower than the floor at {self.floor_mm:.0f} mm over the "
+            f"reachable: inside the joint limits, nothing lower than the floor at {self.floor_mm:.0f} mm above the "
             f"base's origin, links (straight between their frames, with {radii}; a row's radius_mm sets it) clear of "
             f"each other and of the base",
-            f"in view: the line from the station passes no link, {NEAREST_MM / 1e3:g} .. {FARTHEST_MM / 1e3:g} m away "
+            f"in view: the line of sight is clear of all links, {NEAREST_MM / 1e3:g} .. {FARTHEST_MM / 1e3:g} m long "
             f"and within {STEEPEST_DEG:g} deg of the horizon",
         )
 
@@ -95,7 +95,7 @@ class Bodies:
 
     @classmethod
     def of(cls, chain: Chain, x: Floats, readings: Floats) -> Bodies:
-        """Return the bodies at readings (n, joints), deg or mm, of a chain with parameters `x` (p,)."""
+        """Compute the machine's bodies at readings (n, joints), deg or mm, of a chain with parameters `x` (p,)."""
         n, prisms = len(readings), len(chain.rig.prisms)
         here = Chain(chain.rig, {"": Placement.identity()})
         own = np.concatenate([x[: chain.base_start], np.zeros(6)])
@@ -109,7 +109,7 @@ class Bodies:
 
     @property
     def everything_mm(self) -> Floats:
-        """(n, frames + prisms, 3)."""
+        """(n, frames + prisms, 3) positions of all frames and prisms."""
         return np.concatenate([self.frames_mm, self.prisms_mm], axis=1)
 
     @cached_property
@@ -126,11 +126,11 @@ class Bodies:
 
     @cached_property
     def links(self) -> tuple[int, ...]:
-        """Numbers of the rows that have a link of their own."""
+        """Numbers of the rows whose link has a length."""
         return tuple(int(i) + 1 for i in np.flatnonzero(self._lengths_mm >= _LEAST_LINK_MM))
 
     def link_mm(self, number: int) -> tuple[Floats, Floats]:
-        """(n, 3) both ends of the link of a row."""
+        """Return both ends, each (n, 3), of the link of a row."""
         return self.frames_mm[:, self._parents[number - 1]], self.frames_mm[:, number]
 
     def length_mm(self, number: int) -> float:
@@ -138,9 +138,9 @@ class Bodies:
         return float(self._lengths_mm[number - 1])
 
     def between_mm(self, one: int, other: int) -> float:
-        """Mean length of the machine between two links, along the chain; 0 where they share a frame.
+        """Return the mean length along the chain between two links; 0 where they share a frame.
 
-        Links go by the number of their row; the pedestal is 0 and ends at the base.
+        Links are given by row number; the pedestal is 0 and ends at the base.
         """
         ends = [(self._parents[number - 1], number) if number else (0, 0) for number in (one, other)]
         paths = [set(self.rig.path(a)) ^ set(self.rig.path(b)) for a in ends[0] for b in ends[1]]
@@ -172,15 +172,15 @@ def site(
     station_mm: Floats | None = None,
     floor_mm: float | None = None,
 ) -> Site:
-    """Place the station and the floor about a rig.
+    """Determine station and floor of a rig.
 
     Args:
         chain: kinematics.
-        x: (p,) its parameters.
-        setup: the set-up of the chain whose station it is.
-        station_mm: (3,) the station in the base frame. Without it and without a set-up: on its tripod on the floor
-            about the base, never within reach of the machine, where it sees most.
-        floor_mm: height of the floor over the base's origin; 15 % of the reach below it by default.
+        x: (p,) parameters of the chain.
+        setup: index of the set-up that gives the station's place.
+        station_mm: (3,) place of the station in the base frame. Without it and without a set-up, the station is placed
+            on the floor around the base, outside the machine's reach, where it sees most.
+        floor_mm: height of the floor above the base's origin; by default 15 % of the reach below it.
     """
     up = -np.array(chain.rig.gravity) / np.linalg.norm(chain.rig.gravity)
     bodies = Bodies.of(chain, x, spread_poses(chain.rig))
@@ -200,7 +200,7 @@ def site(
 
 
 def placement(at: Site) -> Placement:
-    """Placement of the base in the frame of a levelled station there."""
+    """Return the placement of the base in the frame of a levelled station at `at`."""
     up = at.up
     across = np.cross(np.eye(3)[int(np.argmin(np.abs(up)))], up)
     east = across / np.linalg.norm(across)
@@ -226,7 +226,7 @@ def _best_place(bodies: Bodies, at: Site) -> Site:
 
 
 def is_reachable(bodies: Bodies, at: Site) -> Flags:
-    """(n,) poses in which nothing is below the floor and no link touches another or the pedestal."""
+    """(n,) mask of the poses in which nothing is below the floor and no link touches another or the pedestal."""
     good: Flags = np.all(bodies.everything_mm @ at.up >= at.floor_mm, axis=1)
     for one, other in at.apart:
         good &= _gap_mm(bodies, at, one, other) >= at.radius_mm(one) + at.radius_mm(other)
@@ -234,26 +234,26 @@ def is_reachable(bodies: Bodies, at: Site) -> Flags:
 
 
 def _apart(bodies: Bodies, at: Site) -> tuple[tuple[int, int], ...]:
-    """Pairs of links, by row number and 0 for the pedestal, that are no neighbours and do not always touch."""
+    """Return pairs of links that are not neighbours and do not touch by design, by row number; 0 is the pedestal."""
     found = []
     for i, one in enumerate((0, *bodies.links)):
         for other in bodies.links[i:]:
             width = at.radius_mm(one) + at.radius_mm(other)
             if bodies.between_mm(one, other) > _NEIGHBOURS * width:
                 touches = _gap_mm(bodies, at, one, other) < width
-                if touches.mean() < _BUILT_SO:
+                if touches.mean() < _BY_DESIGN:
                     found.append((one, other))
     return tuple(found)
 
 
 def _gap_mm(bodies: Bodies, at: Site, one: int, other: int) -> Floats:
-    """(n,) distance between the lines of two links, or of the pedestal and a link."""
+    """(n,) distance between the axes of two links, or of the pedestal and a link."""
     ends = bodies.link_mm(one) if one else _pedestal(at, len(bodies))
     return segment_distance(*ends, *bodies.link_mm(other))
 
 
 def in_view(bodies: Bodies, at: Site) -> Flags:
-    """(n, prisms) prisms that the station sees."""
+    """(n, prisms) mask of the prisms that the station sees."""
     n = len(bodies)
     station = np.broadcast_to(at.station_mm, (n, 3))
     obstacles = [(at.radius_mm(number), bodies.link_mm(number)) for number in bodies.links]

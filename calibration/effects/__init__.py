@@ -1,1 +1,1 @@
-"""Named physical effects: what a machine does that rigid kinematics with true readings do not."""
+"""Named physical effects: deviations of a machine from rigid kinematics with exact joint readings."""

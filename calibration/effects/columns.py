@@ -17,22 +17,23 @@ Integers = NDArray[np.intp]
 
 NO_JOINT = -1
 _NEARLY = 1e-5
-_FEW = 50  # coefficients that are summed by one small product, with many zeros
+_FEW = 50  # up to this number, coefficients are summed by one small matrix product in spite of its many zeros
 
 
 @dataclass(frozen=True)
 class EffectColumns:
-    """k coefficients that stand beside the parameters of a chain, for m rows.
+    """k coefficients in addition to the parameters of a chain, for m rows.
 
-    The true value of joint `joint[i]` is its reading plus `column[:, i]` times coefficient i, before couplings. The
-    prism is `shift_mm[:, :, i]` times coefficient i away from where the kinematics have it then.
+    Coefficient i adds `column[:, i]` times its value to the reading of joint `joint[i]`, before couplings. It also adds
+    `shift_mm[:, :, i]` times its value to the prism positions that the kinematics compute from the changed readings.
 
     Attributes:
-        names: of the coefficients, `family@where:name`.
-        joint: (k,) index of the joint that each changes, `NO_JOINT` for none.
-        column: (m, k) deg or mm of that joint per unit of the coefficient; zero where there is none.
+        names: names of the coefficients, `family@where:name`.
+        joint: (k,) index of the joint that each coefficient changes, `NO_JOINT` for none.
+        column: (m, k) change of that joint per unit of the coefficient, deg or mm; zero without a joint.
         prior_sigma: (k,) plausible size of each coefficient, 1 sigma, in its unit.
-        shift_mm: (m, 3, k) in the station's frame, per unit of the coefficient; None where none moves a prism itself.
+        shift_mm: (m, 3, k) displacement in the station's frame per unit of the coefficient; None if no coefficient
+            moves a prism directly.
     """
 
     names: tuple[str, ...]
@@ -48,12 +49,12 @@ class EffectColumns:
         """Apply the effects to rows of observations.
 
         Args:
-            data: m rows, with the readings as they are.
+            data: m rows with the original readings.
             coefficients: (k,) values.
 
         Returns:
-            The rows with the joints where the effects have them, for the kinematics; (m, 3) displacements in the
-            station's frame, to be added to the positions that the kinematics find.
+            The rows with corrected joint values, for the kinematics; and (m, 3) displacements in the station's frame,
+            to be added to the positions that the kinematics compute.
         """
         shift_mm = self.shifted_mm(coefficients)
         return (data.moved(self.change(coefficients, data.readings.shape[1])) if self.joint.size else data), shift_mm
@@ -64,12 +65,12 @@ class EffectColumns:
         """Linearise kinematics and effects together.
 
         Args:
-            kinematics: (m rows) -> positions with derivatives by p parameters, in the station's frame.
-            data: m rows, with the readings as they are.
+            kinematics: function from m rows to positions in the station's frame, with derivatives by p parameters.
+            data: m rows with the original readings.
             coefficients: (k,) values.
 
         Returns:
-            Positions with the effects applied; the Jacobian (m, 3, p + k) has those by coefficients last.
+            Positions with the effects applied; the last k columns of the Jacobian (m, 3, p + k) are by coefficients.
         """
         moved, shift_mm = self.apply(data, coefficients)
         lin = kinematics(moved)
@@ -80,7 +81,12 @@ class EffectColumns:
         return Linearisation(lin.position_mm + shift_mm, jacobian, lin.joint_jacobian)
 
     def change(self, coefficients: Floats, joints: int) -> Floats:
-        """Return the change of all readings (m, joints), deg or mm, by coefficients (k,)."""
+        """Return the change of all readings, (m, joints), deg or mm.
+
+        Args:
+            coefficients: (k,) values.
+            joints: number of joints of the rig.
+        """
         if self.joint.size <= _FEW:
             few: Floats = self.column @ _by_joint(self.joint.tobytes(), coefficients.tobytes(), joints)
             return few
@@ -90,17 +96,17 @@ class EffectColumns:
         return out
 
     def shifted_mm(self, coefficients: Floats) -> Floats:
-        """Return the displacement of the prisms beside that, (m, 3) in the station's frame, by coefficients (k,)."""
+        """Return the direct displacement of the prisms, (m, 3) in the station's frame, for coefficients (k,)."""
         if self.shift_mm is None:
             return np.zeros((self.rows, 3))
         shifted: Floats = self.shift_mm[:, :, self._shifting] @ coefficients[self._shifting]
         return shifted
 
     def moved_mm(self, joint_jacobian: Floats) -> Floats:
-        """Return the whole displacement (m, 3, k) of the prisms per unit of each coefficient.
+        """Return the total displacement (m, 3, k) of the prisms per unit of each coefficient.
 
         Args:
-            joint_jacobian: (m, 3, joints) by readings, mm per deg or mm.
+            joint_jacobian: (m, 3, joints) derivatives of the positions by readings, mm per deg or mm.
         """
         moved = np.empty((self.rows, 3, len(self)))
         self._move(joint_jacobian, moved)
@@ -115,7 +121,7 @@ class EffectColumns:
 
     @cached_property
     def sums(self) -> tuple[int, float, float]:
-        """Number of coefficients and sums of their columns, which tell different ones apart without comparing them."""
+        """Number of coefficients and sums of their columns: a quick check for different sets."""
         return len(self), float(self.column.sum()), 0.0 if self.shift_mm is None else float(self.shift_mm.sum())
 
     @property
@@ -124,16 +130,16 @@ class EffectColumns:
         return len(self.column)
 
     def has_columns_of(self, other: EffectColumns) -> bool:
-        """Return True if these are the very columns in memory of another set of coefficients."""
+        """Return True if both sets share the same arrays in memory."""
         return self.column is other.column and self.shift_mm is other.shift_mm
 
     def with_columns_of(self, other: EffectColumns) -> EffectColumns:
-        """Return the coefficients with the columns in memory of another set, which are equal."""
+        """Return the coefficients with the arrays of another set, whose values are equal."""
         return replace(self, column=other.column, shift_mm=other.shift_mm)
 
     @cached_property
     def _shifting(self) -> slice:
-        """Coefficients from the first to the last one that moves a prism itself."""
+        """Slice from the first to the last coefficient that moves a prism directly."""
         found = np.flatnonzero([] if self.shift_mm is None else self.shift_mm.any(axis=(0, 1)))
         return slice(int(found[0]), int(found[-1]) + 1) if len(found) else slice(0, 0)
 
@@ -141,7 +147,7 @@ class EffectColumns:
         """Return the same coefficients for other rows.
 
         Args:
-            rows: makes values (m', ...) of the other rows from values (m, ...) of these, such as a mean.
+            rows: function from values (m, ...) of these rows to values (m', ...) of the others, such as a mean.
         """
         shift = None if self.shift_mm is None else rows(self.shift_mm)
         return replace(self, column=rows(self.column), shift_mm=shift)
@@ -152,7 +158,12 @@ class EffectColumns:
 
 
 def joined(parts: Sequence[EffectColumns], rows: int) -> EffectColumns:
-    """Join the coefficients of several effects, all for the same number of rows."""
+    """Concatenate the coefficients of several effects.
+
+    Args:
+        parts: coefficients of each effect, all for the same rows.
+        rows: number of rows; needed where there are no parts.
+    """
     shift = None
     if any(part.shift_mm is not None for part in parts):
         zero = [np.zeros((rows, 3, len(part))) if part.shift_mm is None else part.shift_mm for part in parts]
@@ -167,7 +178,7 @@ def joined(parts: Sequence[EffectColumns], rows: int) -> EffectColumns:
 
 
 def same_columns(a: EffectColumns, b: EffectColumns) -> bool:
-    """Return True if two sets of coefficients differ in their names and priors alone."""
+    """Return True if two sets of coefficients differ only in names and priors."""
     if not np.array_equal(a.joint, b.joint):
         return False
     if a.has_columns_of(b):
@@ -180,7 +191,7 @@ def same_columns(a: EffectColumns, b: EffectColumns) -> bool:
 
 
 def nearly_same(a: EffectColumns, b: EffectColumns) -> bool:
-    """Return True if two forms of the same coefficients differ by a hundred-thousandth of the largest value at most."""
+    """Return True if two forms of the same coefficients differ by at most 1e-5 of the largest value."""
     if a.shift_mm is None or b.shift_mm is None:
         return _nearly_equal(a.column, b.column)
     return _nearly_equal(a.column, b.column) and _nearly_equal(a.shift_mm, b.shift_mm)
@@ -192,11 +203,11 @@ def _nearly_equal(one: Floats, other: Floats) -> bool:
 
 
 def sharing(parts: Iterable[EffectColumns], known: Iterable[EffectColumns] = ()) -> tuple[EffectColumns, ...]:
-    """Return the same coefficients, with equal columns in memory once: those of thousands of rows are many megabytes.
+    """Return the same coefficients with equal columns shared in memory: with thousands of rows they take megabytes.
 
     Args:
-        parts: any number, one after the other.
-        known: further ones whose columns may be among them.
+        parts: sets of coefficients.
+        known: further sets whose arrays may be reused.
     """
     kept: dict[tuple[int, float, float], list[EffectColumns]] = {}
     for part in known:
@@ -215,16 +226,16 @@ def sharing(parts: Iterable[EffectColumns], known: Iterable[EffectColumns] = ())
 
 @lru_cache
 def _by_joint(joints: bytes, coefficients: bytes, count: int) -> Floats:
-    """Return (k, count): each coefficient at its joint, else 0; kept for a model that predicts row by row."""
+    """Return (k, count): each coefficient at its joint, else 0; cached for a model that predicts row by row."""
     at = np.frombuffer(joints, dtype=np.intp)[:, None] == np.arange(count)
     return np.where(at, np.frombuffer(coefficients)[:, None], 0.0)
 
 
 @lru_cache
 def _runs(joints: bytes) -> tuple[tuple[int, slice], ...]:
-    """Return each run of coefficients at one joint: its index, and a slice, which copies nothing.
+    """Return each run of coefficients at one joint: the joint's index, and a slice, which avoids copies.
 
-    The columns of those at none are zero, whichever joint `NO_JOINT` is taken for.
+    Coefficients without a joint have zero columns, so it does not matter which joint `NO_JOINT` indexes.
     """
     joint = np.frombuffer(joints, dtype=np.intp)
     edges = [0, *(np.flatnonzero(np.diff(joint)) + 1).tolist(), len(joint)]

@@ -1,4 +1,4 @@
-"""Everything that an effect may look at: a machine, its observations, and quantities that follow from both."""
+"""The inputs of effects: a machine, its observations, and quantities derived from both."""
 
 from __future__ import annotations
 
@@ -16,23 +16,23 @@ from calibration.observations import Floats, Observations
 from calibration.rig.description import Rig
 
 _VOLUME_POSES = 256
-_LEAST_LOAD = 1e-6  # of the largest on any revolute joint; less is rounding
-_LEAST_NM = 1e-6  # a milligram on a lever of 100 mm: less is no load
+_LEAST_LOAD = 1e-6  # share of the largest load on any revolute joint below which a load is rounding error
+_LEAST_NM = 1e-6  # smallest load: a milligram on a lever of 100 mm
 _LEAST_RANGE_MM = 1e-6
-_STEEP = 0.9  # cosine; an axis nearer to the vertical has no level direction to speak of
+_STEEP = 0.9  # cosine; an axis closer to the vertical has no well-defined level direction
 
 
 @dataclass(frozen=True)
 class EffectContext:
-    """A machine and n observations of it; its properties are computed when first asked for, and kept.
+    """A machine and n observations of it; its properties are computed on first use and cached.
 
     Attributes:
         chain: kinematics.
-        x: (p,) its parameters. How the base stands to the station's vertical counts in loads.
+        x: (p,) parameters of the chain. The base's tilt against the station's vertical affects the loads.
         observations: n rows.
-        prepared_loads: the weights of `chain` at `x`, where they have been prepared.
-        prepared_machine: `chain` compiled at `x`, where it has been prepared.
-        levelled: True if gravity is along the station's vertical; otherwise it is as the rig file says.
+        prepared_loads: the weights of `chain` at `x`, if computed before.
+        prepared_machine: `chain` compiled at `x`, if compiled before.
+        levelled: True if gravity is along the station's vertical; otherwise it is as in the rig file.
     """
 
     chain: Chain
@@ -63,7 +63,7 @@ class EffectContext:
 
     @cached_property
     def has_rates(self) -> NDArray[np.bool_]:
-        """(n,) True if the rates of joints are recorded; an empty cell beside others is a joint that stands still."""
+        """(n,) True if any joint rates are recorded; an empty rate then means that the joint stands still."""
         columns = (f"{name}_rate" for name in self.rig.joint_names)
         return np.full(len(self), any(column in self.observations.extra for column in columns))
 
@@ -72,7 +72,7 @@ class EffectContext:
         """The observations bound to the chain."""
         return self.chain.bind(self.observations)
 
-    # -- geometry, from the kinematics and the readings alone, without any effect --------------------------------------
+    # -- geometry from kinematics and readings, without any effect -----------------------------------------------------
 
     @cached_property
     def machine(self) -> CompiledChain:
@@ -86,12 +86,12 @@ class EffectContext:
 
     @cached_property
     def facing(self) -> Facing:
-        """Orientation of the prisms, and the displacement by each drive of a row."""
+        """Orientation of the prisms, and the displacement due to each drive of a row."""
         return self.machine.face(self.data)
 
     @cached_property
     def prism_frame(self) -> NDArray[np.intp]:
-        """(n,) the frame that each fix's prism is mounted on."""
+        """(n,) number of the frame on which each fix's prism is mounted."""
         frames = np.array([prism.frame for prism in self.rig.prisms], dtype=np.intp)
         return frames[self.data.prism]
 
@@ -106,7 +106,7 @@ class EffectContext:
         return self.machine.rotations(self.data)
 
     def to_station(self, vectors: Floats) -> Floats:
-        """Turn vectors (n, 3, k) of the base frame into the station's frame."""
+        """Transform vectors (n, 3, k) from the base frame to the station's frame."""
         return self.rotation @ vectors
 
     @cached_property
@@ -137,12 +137,12 @@ class EffectContext:
         return self.to_station(moved * amount[:, None, None])
 
     def mast_tilt_mm(self, share: float) -> Floats:
-        """Return (n, 3, 2) displacements in the station's frame, mm per rad, as all above a point of the mast tilts.
-
-        Args:
-            share: where the point is, from the base frame's origin, 0, to the frame that the first joint moves, 1.
+        """Return (n, 3, 2) displacements in the station's frame, mm per rad, as the mast tilts above a point of it.
 
         The columns are tilts about the level axes x and y through that point; see `level_axes`.
+
+        Args:
+            share: position of the point: 0 at the base frame's origin, 1 at the frame that the first joint moves.
         """
         first = self.rig.joint_names[0]
         moved_row = next(
@@ -180,7 +180,7 @@ class EffectContext:
         return self._torques[:, self.chain.joint_index[joint]]
 
     def torque_parts(self, joint: str) -> Floats:
-        """Return (n, parts) changes of the load on a joint when a weight, or its lever, is `MASS_SIGMA` larger."""
+        """Return (n, parts) changes of the load on a joint if a weight, or its lever, is larger by `MASS_SIGMA`."""
         return self._parts[:, self.chain.joint_index[joint]]
 
     def is_torque_measured(self, joint: str) -> bool:
@@ -190,19 +190,19 @@ class EffectContext:
     def payload_torque(self, joint: str) -> Floats:
         """Return the (n,) load that the payload of each row adds to a joint, N m or N; 0 where it is not known."""
         with_payload, without = (self.loads(self.data.readings, extra, self.down) for extra in self._payloads)
-        # Not a number where there are no masses
+        # NaN where there are no masses.
         return np.nan_to_num(with_payload - without)[:, self.chain.joint_index[joint]]
 
     def payload_parts(self, joint: str) -> Floats:
-        """Return the (n, parts) changes of `payload_torque`, as `torque_parts` has those of the whole load."""
+        """Return the (n, parts) changes of `payload_torque`, like `torque_parts` for the total load."""
         with_payload, without = (self.loads.parts(self.data.readings, extra, self.down) for extra in self._payloads)
         return (with_payload - without)[:, self.chain.joint_index[joint]]
 
     def greatest_torque(self, joint: str) -> float:
         """Return the largest load on a joint in the work volume; in the observations if the rig has no masses.
 
-        0 where it is nothing beside the loads of the other revolute joints as designed: the little that a vertical
-        axis carries because it was not built quite so depends on more than is known.
+        Returns 0 where the load as designed is negligible compared with those of the other revolute joints. The small
+        load on a vertical axis due to build errors depends on quantities that are not known.
         """
         designed = self.as_designed
         by_joint = [designed._greatest(j.name) for j in self.rig.joints if j.kind == "revolute"]
@@ -216,7 +216,7 @@ class EffectContext:
 
     @cached_property
     def greatest_moments(self) -> dict[int, float]:
-        """Row -> the largest moment beyond it in the work volume, N m, as far as links have asked for it."""
+        """Cache: row -> largest moment of the weights beyond it in the work volume, N m; filled by links."""
         return {}
 
     @cached_property
@@ -238,7 +238,7 @@ class EffectContext:
 
     @property
     def _payloads(self) -> tuple[dict[str, Floats], dict[str, Floats]]:
-        """Optional columns with the payload and without."""
+        """Optional columns with the payload and without it."""
         kg = np.nan_to_num(self.extra("payload_kg"))
         return {"payload_kg": kg}, {"payload_kg": np.zeros_like(kg)}
 
@@ -246,7 +246,7 @@ class EffectContext:
 
     @cached_property
     def work_volume(self) -> EffectContext:
-        """Context of this machine in poses spread evenly between the limits of its joints, nothing else measured."""
+        """Context of this machine in poses spread evenly between the joint limits, without optional columns."""
         unit = halton(len(self.rig.joints), _VOLUME_POSES)
         blank = np.full((_VOLUME_POSES, 3), np.nan)
         empty = np.full(_VOLUME_POSES, "")
@@ -257,19 +257,19 @@ class EffectContext:
 
     @cached_property
     def as_designed(self) -> EffectContext:
-        """Context of these observations for a machine that is as its rig file has it."""
+        """Context of these observations for the machine exactly as in its rig file."""
         x = np.zeros_like(self.x)
         return replace(self, x=x, prepared_loads=None, prepared_machine=None, levelled=False)
 
 
 def level_axes(gravity: tuple[float, float, float]) -> Floats:
-    """Return two level axes of the base frame and the one that points up, as rows (3, 3).
+    """Return two level axes of the base frame and the axis that points up, as rows (3, 3).
 
-    Up is against the rig file's gravity, and x is the frame's own x axis made level: the frame's axes themselves, where
-    its z axis is up.
+    Up is opposite to the rig file's gravity, and x is the frame's own x axis made level. If the frame's z axis points
+    up, these are the frame's own axes.
 
     Args:
-        gravity: its direction in the base frame, of any length.
+        gravity: direction of gravity in the base frame, of any length.
     """
     up = -np.array(gravity) / np.linalg.norm(gravity)
     own = np.eye(3)[0 if abs(up[0]) < _STEEP else 1]
@@ -293,22 +293,22 @@ class Carried:
 
     @cached_property
     def _beyond(self) -> NDArray[np.bool_]:
-        """(rows + 1,) mask of the frames that move with it."""
+        """(rows + 1,) mask of the frames that move with the row."""
         rig = self.context.rig
         return np.array([self.row in rig.path(frame) for frame in range(len(rig.rows) + 1)])
 
     @cached_property
     def carries_prism(self) -> NDArray[np.bool_]:
-        """(n,) mask of the observations whose prism moves with it."""
+        """(n,) mask of the observations whose prism moves with the row."""
         carried: NDArray[np.bool_] = self._beyond[self.context.prism_frame]
         return carried
 
     @cached_property
     def hanging(self) -> NDArray[np.bool_]:
-        """(points,) mask of the machine's weights that it carries."""
+        """(points,) mask of the machine's point weights that the row carries."""
         return self._beyond[self.context.loads.point_frame]
 
     @cached_property
     def weights(self) -> tuple[Floats, Floats]:
-        """(n, points, 3) places of the machine's weights, mm, and (n, points) their sizes, N."""
+        """(n, points, 3) positions of the machine's point weights, mm, and (n, points) their sizes, N."""
         return self.context.loads.places(self.context.data.readings, self.context.observations.extra)

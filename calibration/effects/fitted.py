@@ -1,4 +1,4 @@
-"""Effects as they are chosen, fitted, and applied to observations."""
+"""Effects: selected variants, fitted effects, and their application to observations."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ _CHANCE = 2.0  # standard errors
 
 @dataclass(frozen=True)
 class FittedEffect:
-    """An effect that a model has.
+    """A fitted effect of a model.
 
     Attributes:
-        family, where: which effect it is and the place it is at.
-        coefficients: in the family's order, with standard errors of the fit; `reported` is for people.
-        settings: the numbers of its variant.
-        regime: the rows in which it acts; None for all.
+        family, where: family of the effect, and its place.
+        coefficients: fitted coefficients in the family's order, with standard errors; see `reported` for output.
+        settings: settings of the variant.
+        regime: the rows in which the effect acts; None for all.
     """
 
     family: str
@@ -42,7 +42,7 @@ class FittedEffect:
         return f"{self.family}@{self.where}"
 
     def as_dict(self) -> dict[str, object]:
-        """Return the JSON object (docs/reference/formats.md, gap), with the form and the numbers of the variant."""
+        """Return the JSON object (docs/reference/formats.md, gap), with the form and settings of the variant."""
         return {
             "family": self.family,
             "where": self.where,
@@ -54,19 +54,19 @@ class FittedEffect:
             "regime": None if self.regime is None else self.regime.as_dict(),
         }
 
-    def elsewhere(self, context: EffectContext) -> FittedEffect:
-        """The effect at set-ups whose bases are fitted anew on the observations of a context."""
-        return replace(self, settings=library()[self.family].elsewhere(context, self.where, self.settings))
+    def at_new_setups(self, context: EffectContext) -> FittedEffect:
+        """Return the effect for new set-ups, whose bases are fitted to the observations of a context."""
+        return replace(self, settings=library()[self.family].at_new_setups(context, self.where, self.settings))
 
     @property
     def form(self) -> str:
-        """A phrase that names its form; empty where there is nothing to tell."""
+        """Phrase that describes variant and regime; empty for a plain effect."""
         form = library()[self.family].form(self.settings)
         return ", ".join(text for text in (form, self.regime.text if self.regime else "") if text)
 
     @property
     def reported(self) -> tuple[FittedCoefficient, ...]:
-        """The numbers that outputs list."""
+        """The numbers to report in outputs."""
         return library()[self.family].reported(self.settings, self.coefficients)
 
 
@@ -75,10 +75,10 @@ class Choice:
     """One variant of an effect at one place, before a fit.
 
     Attributes:
-        family, where: which effect, and the place it is at.
-        settings: the numbers of its variant.
-        scale: factor on the plausible sizes of its coefficients, where the data say that they are larger or smaller.
-        regime: the rows in which it acts; None for all.
+        family, where: family of the effect, and its place.
+        settings: settings of the variant.
+        scale: factor on the plausible sizes of the coefficients, selected by the data.
+        regime: the rows in which the effect acts; None for all.
     """
 
     family: str
@@ -91,7 +91,7 @@ class Choice:
         return f"{self.family}@{self.where}"
 
     def columns(self, context: EffectContext) -> EffectColumns:
-        """Return its coefficients for the observations of a context."""
+        """Return the effect's columns for the observations of a context."""
         family = library()[self.family]
         found = family.coefficients(context, self.where, self.settings)
         column, shift = _moves(family, context, self)
@@ -104,7 +104,13 @@ class Choice:
         )
 
     def fitted(self, context: EffectContext, values: Floats, standard_errors: Floats) -> FittedEffect:
-        """Return the effect as a fit found it, values and standard errors (k,)."""
+        """Return the effect with fitted coefficients.
+
+        Args:
+            context: the observations.
+            values: (k,) fitted coefficients.
+            standard_errors: (k,) standard errors.
+        """
         found = library()[self.family].coefficients(context, self.where, self.settings)
         coefficients = tuple(
             FittedCoefficient(c.name, c.unit, float(value), float(error), c.sigma)
@@ -112,10 +118,15 @@ class Choice:
         )
         return FittedEffect(self.family, self.where, coefficients, dict(self.settings), self.regime)
 
-    def beyond(self, context: EffectContext, values: Floats, standard_errors: Floats) -> tuple[str, ...]:
-        """Return the names of the coefficients (k,) that are beyond their hard limits by more than chance.
+    def beyond_limits(self, context: EffectContext, values: Floats, standard_errors: Floats) -> tuple[str, ...]:
+        """Return the names of the coefficients that exceed their hard limits significantly.
 
-        Those that only shape an effect, and are not reported, have none; see `strained`.
+        Coefficients that only shape an effect are not reported and not checked here; see `has_implausible_shape`.
+
+        Args:
+            context: the observations.
+            values: (k,) fitted coefficients.
+            standard_errors: (k,) standard errors.
         """
         family = library()[self.family]
         limits = {c.name: c for c in family.coefficients(context, self.where, self.settings)}
@@ -129,26 +140,26 @@ class Choice:
                 out.append(c.name)
         return tuple(out)
 
-    def strained(self, values: Floats, standard_errors: Floats) -> bool:
-        """Return True if coefficients that only shape the effect are implausibly large; see `Family.strained`."""
-        return library()[self.family].strained(self.settings, values, standard_errors)
+    def has_implausible_shape(self, values: Floats, standard_errors: Floats) -> bool:
+        """Return True if coefficients that only shape the effect are implausible; see the method of `Family`."""
+        return library()[self.family].has_implausible_shape(self.settings, values, standard_errors)
 
 
 class AppliedEffects:
     """The effects of a model, prepared for any observations of its rig.
 
-    An effect does nothing in rows that lack what it needs.
+    An effect is zero in rows that lack its inputs.
 
     Args:
-        effects: with k coefficients together.
-        chain: whose joints they are at.
+        effects: the effects, with k coefficients in total.
+        chain: the kinematics.
 
     Attributes:
-        names: (k,) `family@where:name` of each coefficient.
-        joint: (k,) index of the joint that each changes, `NO_JOINT` for none.
-        values: (k,) of the coefficients.
-        machine_values: (k,) the same; 0 for those that do not move prisms in the base frame.
-        goes_by_order: True if the change in a row depends on the rows before it.
+        names: `family@where:name` of each of the k coefficients.
+        joint: (k,) index of the joint that each coefficient changes, `NO_JOINT` for none.
+        values: (k,) values of the coefficients.
+        machine_values: (k,) the same, but 0 for effects that do not move prisms in the base frame.
+        depends_on_order: True if the change in a row depends on the preceding rows.
     """
 
     def __init__(self, effects: Sequence[FittedEffect], chain: Chain) -> None:
@@ -160,11 +171,11 @@ class AppliedEffects:
         self.joint = np.repeat(np.array(at, dtype=np.intp), np.diff(ends))
         self.values = coefficient_values(effects)
         self.machine_values = self.values * np.repeat(np.array(of_machine, dtype=bool), np.diff(ends))
-        self.goes_by_order = any(family.goes_by_order(effect.settings) for family, effect, _ in self._parts)
+        self.depends_on_order = any(family.depends_on_order(effect.settings) for family, effect, _ in self._parts)
         self._joints = len(chain.joint_index)
         self._prior_sigma = np.array([c.prior_sigma for effect in effects for c in effect.coefficients])
         self._shifts = bool((self.joint == NO_JOINT).any())
-        # Most effects lack nothing ever; the variance that the others leave does not depend on the rows.
+        # Effects whose inputs may be missing. Their variance in such rows does not depend on the rows.
         self._unknown = [
             (effect, joint, _unknown_variance(effect))
             for (family, effect, _), joint in zip(self._parts, at, strict=True)
@@ -172,7 +183,7 @@ class AppliedEffects:
         ]
 
     def columns(self, context: EffectContext) -> EffectColumns:
-        """Return the coefficients for the observations of a context, n rows."""
+        """Return the columns of all effects for the n observations of a context."""
         column = np.zeros((len(context), len(self.joint)))
         shift_mm = np.zeros((len(context), 3, len(self.joint))) if self._shifts else None
         for family, effect, own in self._parts:
@@ -183,7 +194,7 @@ class AppliedEffects:
         return EffectColumns(self.names, self.joint, column, self._prior_sigma, shift_mm)
 
     def unknown_variance(self, context: EffectContext) -> Floats:
-        """Return the variance (n, joints) of joint values in rows that lack what an effect needs, deg^2 or mm^2."""
+        """Return the variance (n, joints) of joint values in rows that lack inputs of an effect, deg^2 or mm^2."""
         out = np.zeros((len(context), self._joints))
         for effect, joint, variance in self._unknown:
             known = _known(effect, context)
@@ -192,7 +203,7 @@ class AppliedEffects:
         return out
 
     def unknown_mm2(self, context: EffectContext) -> Floats:
-        """Return the variance (n,) of each coordinate in rows that lack what an effect on the prism needs, mm^2."""
+        """Return the variance (n,) per coordinate in rows that lack inputs of an effect on the prism, mm^2."""
         out = np.zeros(len(context))
         for effect, joint, variance in self._unknown:
             if joint == NO_JOINT:
@@ -201,7 +212,7 @@ class AppliedEffects:
 
 
 def fitted_columns(effects: Sequence[FittedEffect], context: EffectContext) -> EffectColumns:
-    """Return the coefficients of a model's effects for other observations."""
+    """Return the columns of a model's effects for the observations of a context."""
     return AppliedEffects(effects, context.chain).columns(context)
 
 
@@ -211,13 +222,19 @@ def coefficient_values(effects: Sequence[FittedEffect]) -> Floats:
 
 
 def corrected(observations: Observations, change: Floats, names: Sequence[str]) -> Observations:
-    """Return observations with a change (n, joints) added to the readings of the joints called `names`."""
+    """Return observations with a change added to the readings.
+
+    Args:
+        observations: n rows.
+        change: (n, joints) change, deg or mm.
+        names: names of the joints, in the order of the columns of `change`.
+    """
     joints: Mapping[str, Floats] = {name: observations.joints[name] + change[:, i] for i, name in enumerate(names)}
     return replace(observations, joints=joints)
 
 
-def left_out(effects: Sequence[FittedEffect], context: EffectContext) -> tuple[str, ...]:
-    """Return a sentence for every effect that lacks an input in some of these observations."""
+def missing_inputs(effects: Sequence[FittedEffect], context: EffectContext) -> tuple[str, ...]:
+    """Return a sentence for every effect whose inputs are missing in some of these observations."""
     sentences = []
     for effect in effects:
         needs = library()[effect.family].needs(effect.where) or (effect.regime.variable if effect.regime else "")
@@ -240,17 +257,17 @@ def _joint(family: Family, chain: Chain, where: str) -> int:
 
 
 def _known(effect: FittedEffect, context: EffectContext) -> NDArray[np.bool_]:
-    """Return an (n,) mask of the rows that have what an effect needs."""
+    """Return an (n,) mask of the rows in which all inputs of an effect are known."""
     known = library()[effect.family].known(context, effect.where)
     return known if effect.regime is None else known & effect.regime.known(context)
 
 
 def _moves(family: Family, context: EffectContext, effect: Choice | FittedEffect) -> tuple[Floats, Floats | None]:
-    """Return (n, k) columns at the joint; (n, 3, k) displacements of the prism, None for effects at a joint."""
+    """Return (n, k) columns at the joint, and (n, 3, k) prism displacements, or None for an effect at a joint."""
     acts = None if effect.regime is None else effect.regime.holds(context).astype(np.float64)
     if isinstance(family, JointFamily):
         column = family.columns(context, effect.where, effect.settings)
         return column if acts is None else column * acts[:, None], None
-    assert isinstance(family, PrismFamily)  # there are these two
+    assert isinstance(family, PrismFamily)  # the only other kind
     shift = family.shift_mm(context, effect.where, effect.settings)
     return np.zeros((len(context), shift.shape[2])), shift if acts is None else shift * acts[:, None, None]

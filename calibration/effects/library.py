@@ -28,12 +28,16 @@ def library() -> Mapping[str, Family]:
 def parse_effects(text: str, rig: Rig) -> tuple[tuple[str, str], ...]:
     """Parse `FAMILY@WHERE,...`.
 
+    Args:
+        text: the text.
+        rig: the rig, which determines the possible places.
+
     Returns:
-        (family, where) of each, in the order of the text.
+        (family, where) of each effect, in the order of the text.
 
     Raises:
-        ValueError: an unknown family, a place that this rig does not have for it, one named twice; the message is a
-            sentence that says what there is.
+        ValueError: a family is unknown, a place does not exist on this rig, or an effect is named twice; the message
+            lists the valid choices.
     """
     found: list[tuple[str, str]] = []
     for part in text.split(","):

@@ -1,4 +1,4 @@
-"""Links that bend under what they carry: where a row turns, the weights' moment there, and effects of that."""
+"""Links that deflect under their load: pivots of rows, the moments of the weights there, and effects of these."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from calibration.effects.context import Carried, EffectContext
 from calibration.effects.load_shapes import (
     UNIT,
     LoadShapes,
-    OfUncertainLoad,
+    UncertainLoadFamily,
     load_columns,
     load_variants,
     part_coefficients,
@@ -29,7 +29,7 @@ _LINEAR = "compliance_rad_per_Nm"
 _SIGMA_RAD = 1e-3  # at the largest moment of the weights beyond
 _BOUND_RAD = 20e-3
 _LEAST_NM = 1e-6
-_LEAST_SHARE = 0.01  # of the largest moment; a link that gives way to less of it shows nothing
+_LEAST_SHARE = 0.01  # smallest share of the largest moment for which the deflection of a link is visible
 
 
 @dataclass(frozen=True)
@@ -38,23 +38,23 @@ class Link(Carried):
 
     @property
     def axis(self) -> Floats:
-        """(n, 3) unit vectors of the axis about which the row turns."""
+        """(n, 3) unit vectors of the axis about which the row turns, in the base frame."""
         return self._turning[0]
 
     @property
     def place_mm(self) -> Floats:
-        """(n, 3) where it turns: the origin of the frame in which the rotation is made."""
+        """(n, 3) position of the pivot: the origin of the frame of the rotation, in the base frame."""
         return self._turning[1]
 
     @cached_property
     def moment_newton_m(self) -> Floats:
-        """(n, 3) moment about its place of all weights beyond."""
+        """(n, 3) moment about the pivot of all weights beyond it."""
         moment: Floats = self._by_point.sum(axis=1)
         return moment
 
     @cached_property
     def parts_newton_m(self) -> Floats:
-        """(n, 3, parts) changes of that moment as a mass, or its centre's distance, is `MASS_SIGMA` larger."""
+        """(n, 3, parts) changes of that moment if a mass, or its centre's distance, is larger by `MASS_SIGMA`."""
         loads, rig = self.context.loads, self.context.rig
         origins_mm = self.context.located.frames_mm[:, loads.point_frame]
         at_origins = self._moments(origins_mm)
@@ -72,7 +72,7 @@ class Link(Carried):
         return self._moments(self.weights[0])
 
     def _moments(self, places_mm: Floats) -> Floats:
-        """Return the moments (n, points, 3) of the weights beyond, hung at these places (n, points, 3)."""
+        """Return the moments (n, points, 3) of the weights beyond the pivot if placed at positions (n, points, 3)."""
         newton = self.weights[1] * self.hanging
         arm_mm = places_mm - self.place_mm[:, None]
         moments: Floats = np.cross(arm_mm * (newton[:, :, None] / 1e3), self.context.down[:, None])
@@ -80,7 +80,7 @@ class Link(Carried):
 
     @cached_property
     def _turning(self) -> tuple[Floats, Floats]:
-        """The axis and the place: a walk along the chain up to the row's rotation."""
+        """Axis and pivot, by following the chain up to the row's rotation."""
         chain, x, readings = self.context.chain, self.context.x, self.context.data.readings
         axes = np.tile(np.eye(3), (len(readings), 1, 1))
         place_mm = np.zeros((len(readings), 3))
@@ -98,7 +98,7 @@ class Link(Carried):
 
 
 def _turn(ops: list[Op]) -> Op:
-    """Return the rotation of a row that joints drive."""
+    """Return the rotation of a row that is driven by joints."""
     return next(op for op in ops if op.rotates and op.drive)
 
 
@@ -106,22 +106,27 @@ def _up_to_turn(ops: list[Op]) -> list[Op]:
     return ops[: ops.index(_turn(ops))]
 
 
-class LinkFamily(OfUncertainLoad, PrismFamily):
-    """A link that turns a little, about the place where its row turns, in proportion to a part of the weights' moment.
+class LinkFamily(UncertainLoadFamily, PrismFamily):
+    """A link that turns slightly about its row's pivot, in proportion to a component of the weights' moment.
 
-    All that is beyond moves with it as one. How stiff a link may be goes by the largest moment of all weights beyond,
-    whatever part of that the link gives way to.
+    All parts beyond the link move with it as a rigid body. The plausible compliance is derived from the largest moment
+    of all weights beyond the pivot, whichever component deflects the link.
     """
 
-    goes_with = "weights"
+    load_kind = "weights"
 
     @abstractmethod
     def row(self, rig: Rig, where: str) -> int:
         """Return the number of the row that turns."""
 
     @abstractmethod
-    def given_way_to(self, axis: Floats, moments: Floats) -> Floats:
-        """Return the part (n, 3, k) of moments (n, 3, k) to which a link gives way that turns about an axis (n, 3)."""
+    def deflecting_moment(self, axis: Floats, moments: Floats) -> Floats:
+        """Return the component (n, 3, k) of the moments that deflects a link.
+
+        Args:
+            axis: (n, 3) unit vectors of the axis about which the link's row turns.
+            moments: (n, 3, k) moments about the row's pivot.
+        """
 
     def variants(self, context: EffectContext, where: str) -> tuple[Settings, ...]:
         link = Link(context, self.row(context.rig, where))
@@ -150,16 +155,16 @@ class LinkFamily(OfUncertainLoad, PrismFamily):
         return context.to_station(np.cross(turns, arm_mm[:, None]).transpose(0, 2, 1))
 
     def _loads(self, link: Link) -> Floats:
-        """Return the moment (3 n,) to which a link gives way, N m, by rows and coordinates."""
-        return self.given_way_to(link.axis, link.moment_newton_m[:, :, None]).reshape(-1)
+        """Return the moment (3 n,) that deflects a link, N m, ordered by row and coordinate."""
+        return self.deflecting_moment(link.axis, link.moment_newton_m[:, :, None]).reshape(-1)
 
     def _parts(self, link: Link) -> Floats:
-        """Return the changes (3 n, parts) of that by the uncertain parts of the weights."""
-        parts = self.given_way_to(link.axis, link.parts_newton_m)
+        """Return the changes (3 n, parts) of `_loads` due to the uncertain parts of the weights."""
+        parts = self.deflecting_moment(link.axis, link.parts_newton_m)
         return parts.reshape(-1, parts.shape[2])
 
     def shapes(self, context: EffectContext, where: str) -> LoadShapes:
-        """Return the shapes by which uncertain weights change that over the poses."""
+        """Return the shapes of the load's uncertainty due to uncertain weights."""
 
         def in_volume(volume: EffectContext) -> tuple[Floats, Floats]:
             link = Link(volume, self.row(volume.rig, where))
@@ -169,7 +174,7 @@ class LinkFamily(OfUncertainLoad, PrismFamily):
 
 
 def _greatest(context: EffectContext, row: int) -> float:
-    """Return the largest moment of the weights beyond a row in the work volume, N m; 0 where there is none."""
+    """Return the largest moment of the weights beyond a row in the work volume, N m; 0 without masses."""
     if not context.rig.masses:
         return 0.0
     if row not in context.greatest_moments:
@@ -179,7 +184,7 @@ def _greatest(context: EffectContext, row: int) -> float:
 
 
 def own_rows(rig: Rig) -> dict[str, int]:
-    """Return the row that each revolute joint turns first, by the joint's name; those that turn none have none."""
+    """Return joint name -> number of the first row that the joint turns, for revolute joints that turn a row."""
     found: dict[str, int] = {}
     for number, driven, name, _ in rig.couplings():
         if driven == "theta" and rig.joint(name).kind == "revolute":

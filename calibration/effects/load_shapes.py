@@ -1,10 +1,11 @@
-"""Uncertainty of the load on a joint by that of a rig file's masses: nobody has weighed a boom part by part.
+"""Uncertainty of the load on a joint due to uncertain masses in the rig file, as booms are not weighed part by part.
 
-An effect c * load becomes c * (load + parts @ p), p standard normal numbers, one for each weight and for each distance
-of a centre of gravity that is uncertain. Much of that only makes the whole load larger or smaller, which no pose tells
-from a larger or smaller c: it stays out of the fit and counts in the standard error of c. What changes the load's
-course over the work volume are few shapes; each gets a coefficient of its own. Its prior is normal for a given c, so
-its plausible size is that of c; where the data say that c is larger or smaller, the shapes' are with it (`Choice`).
+An effect c * load becomes c * (load + parts @ p), where p are standard normal numbers, one for each uncertain weight
+and each uncertain distance of a centre of gravity. Much of this only scales the whole load, which no pose can
+distinguish from a larger or smaller c. This part is left out of the fit and included in the standard error of c. The
+changes of the load's course over the work volume are spanned by a few shapes, each with its own coefficient. Given c,
+the prior of a coefficient is normal, so its plausible size is that of c. If the data scale the plausible size of c,
+that of the shapes is scaled too (`Choice`).
 """
 
 from __future__ import annotations
@@ -26,9 +27,9 @@ from calibration.observations import Floats
 
 UNIT = "rad/(N m)"
 _LOAD_SIGMA, _ABOUT, _PARTS = "load_sigma", "about_rad_per_Nm", "parts"
-_LEAST_SHAPE = 1e-3  # of the load; less than this of a deflection is invisible
+_LEAST_SHAPE = 1e-3  # smallest shape as a share of the load; a smaller share of a deflection is not measurable
 _MOST_PARTS = 100
-_MOST_SIGMAS = 3.0  # of a shape, a mixture of weights and centres that are within +-15 %
+_MOST_SIGMAS = 3.0  # largest plausible value of a shape, a mixture of weights and centres that are within +-15 %
 _CHANCE = 2.0  # standard errors
 
 
@@ -37,8 +38,8 @@ class LoadShapes:
     """Shapes by which uncertain weights change a load over the poses.
 
     Attributes:
-        share: (parts,) by how much of itself the load is larger when a part is 1 sigma larger.
-        mixing: (parts, r) how the rest makes up r shapes, each 1 sigma.
+        share: (parts,) relative change of the whole load per sigma of each part.
+        mixing: (parts, r) combination of the remaining changes into r shapes, each of 1 sigma.
     """
 
     share: Floats
@@ -49,15 +50,15 @@ class LoadShapes:
 
     @property
     def load_sigma(self) -> float:
-        """Uncertainty of the whole load, as a share of it."""
+        """Relative uncertainty of the whole load, 1 sigma."""
         return float(np.linalg.norm(self.share))
 
     def __call__(self, load: Floats, parts: Floats) -> Floats:
-        """Return the change of a load (n, r), N m per sigma of each shape; 0 where no part is known.
+        """Return the change of a load (n, r), N m per sigma of each shape; 0 in rows where no part is known.
 
         Args:
-            load: (n,) N m.
-            parts: (n, parts) change of it per sigma of each part.
+            load: (n,) load, N m.
+            parts: (n, parts) change of the load per sigma of each part, N m.
         """
         known = parts.any(axis=1)
         left = parts - np.where(known, load, 0.0)[:, None] * self.share
@@ -66,19 +67,19 @@ class LoadShapes:
 
 
 def load_shapes(load: Floats, parts: Floats, *, constant: bool = False) -> LoadShapes:
-    """Find the shapes of a load over a work volume of n poses, the largest first.
+    """Compute the shapes of a load over a work volume of n poses, largest first.
 
     Args:
-        load: (n,) N m.
-        parts: (n, k) its change per sigma of each part.
-        constant: True if a change that is constant over the poses counts as well, as it does where a load changes its
-            sign. An encoder's zero takes it up otherwise.
+        load: (n,) load, N m.
+        parts: (n, k) change of the load per sigma of each part, N m.
+        constant: True to include changes that are constant over the poses. They matter where the sign of a load counts;
+            otherwise an encoder's zero absorbs them.
     """
     level = np.column_stack([np.zeros(len(load)) if constant else np.ones(len(load)), load])
     share = np.linalg.lstsq(level, parts)[0][1]
     _, size, directions = np.linalg.svd(parts - load[:, None] * share, full_matrices=False)
     mixing = directions[size > _LEAST_SHAPE * np.linalg.norm(load)].T
-    # A direction has no sign; the largest part decides.
+    # The sign of a direction is arbitrary; make its largest component positive.
     return LoadShapes(share, mixing * np.sign(mixing[np.abs(mixing).argmax(axis=0), np.arange(mixing.shape[1])]))
 
 
@@ -92,12 +93,12 @@ def shapes_by_design(
     *,
     constant: bool = False,
 ) -> LoadShapes:
-    """Return the shapes of a load on the machine as designed, from its work volume; found once for each chain.
+    """Return the shapes of a load on the machine as designed, over its work volume; cached for each chain.
 
     Args:
-        context: whose chain it is.
-        load: a name to remember it by.
-        volume: the load (n,) and its parts (n, k) in a work volume.
+        context: a context of the chain.
+        load: name of the load, the cache key.
+        volume: function that returns the load (n,) and its parts (n, k) in a work volume.
         constant: as for `load_shapes`.
     """
     if not context.rig.masses:
@@ -109,7 +110,7 @@ def shapes_by_design(
 
 
 def gravity_shapes(context: EffectContext, where: str, *, constant: bool = False) -> LoadShapes:
-    """Return the shapes of gravity's load on a joint; `constant` as for `load_shapes`."""
+    """Return the shapes of the gravity load on a joint; `constant` as for `load_shapes`."""
     return shapes_by_design(
         context,
         f"{where} with its constant part" if constant else where,
@@ -121,35 +122,35 @@ def gravity_shapes(context: EffectContext, where: str, *, constant: bool = False
 def load_columns(
     load: Floats, settings: Settings, shapes: Callable[[], LoadShapes], parts: Callable[[], Floats]
 ) -> Floats:
-    """Return a load, and its change for each coefficient of a variant that shapes it.
+    """Return a load, and its change for each shape coefficient of a variant.
 
     Args:
-        load: (n,) N m, 0 where not known.
-        settings: the variant, as `load_variants` makes them.
-        shapes: returns the shapes of the load; asked only if the variant has some.
-        parts: returns its change (n, parts) per sigma of each part; likewise.
+        load: (n,) load, N m, 0 where not known.
+        settings: a variant as returned by `load_variants`.
+        shapes: function that returns the shapes of the load; called only if the variant has shapes.
+        parts: function that returns the change (n, parts) per sigma of each part; called likewise.
 
     Returns:
         (n, 1 + r) N m.
 
     Raises:
-        ModelError: the variant is of other shapes, made by another version of this program.
+        ModelError: the variant belongs to different shapes, of a different version of this program.
     """
     names = part_names(settings)
     if not names:
         return load[:, None]
     found = shapes()
     if len(names) != len(found):
-        raise ModelError(f"the model has {len(names)} shapes of a load that has {len(found)}; calibrate again")
+        raise ModelError(f"the model has {len(names)} shapes of a load, its rig {len(found)}; calibrate again")
     return np.column_stack([load, found(load, parts())])
 
 
 def load_variants(shapes: LoadShapes, plausible: float) -> tuple[Settings, ...]:
-    """Return the variants of an effect in proportion to a load: without its shapes and with them.
+    """Return the variants of an effect proportional to a load: without and with shapes of the load.
 
     Args:
-        shapes: of its load; none where the load is measured.
-        plausible: size of the effect's own coefficient, rad per N m.
+        shapes: shapes of the load; empty where the load is measured.
+        plausible: plausible size of the effect's own coefficient, rad per N m.
     """
     if shapes.load_sigma == 0.0:
         return ({},)
@@ -161,7 +162,7 @@ def part_names(settings: Settings) -> tuple[str, ...]:
     """Return the names of the coefficients that shape the load.
 
     Raises:
-        ValueError: settings that `load_variants` does not make.
+        ValueError: the settings are not those of `load_variants`.
     """
     if set(settings) <= {_LOAD_SIGMA} and settings.get(_LOAD_SIGMA, 0.0) >= 0.0:
         return ()
@@ -178,14 +179,14 @@ def part_names(settings: Settings) -> tuple[str, ...]:
 
 
 def part_coefficients(settings: Settings, bound: float) -> tuple[Coefficient, ...]:
-    """Return the coefficients that shape the load, within +-`bound`, rad per N m."""
+    """Return the coefficients that shape the load, with hard limits +-`bound`, rad per N m."""
     return tuple(Coefficient(name, UNIT, settings[_ABOUT], -bound, bound) for name in part_names(settings))
 
 
-class OfUncertainLoad(Family):
-    """An effect in proportion to a load: its own coefficient, and after it those of what is uncertain of the load."""
+class UncertainLoadFamily(Family):
+    """An effect proportional to an uncertain load: its own coefficient, followed by those of the load's shapes."""
 
-    limit_sigma = MASS_SIGMA  # limits are what it may do at the largest load
+    limit_sigma = MASS_SIGMA  # the limits are derived from the largest load
 
     def reported(
         self, settings: Settings, coefficients: tuple[FittedCoefficient, ...]
@@ -195,17 +196,17 @@ class OfUncertainLoad(Family):
         error = math.hypot(own.standard_error, settings.get(_LOAD_SIGMA, 0.0) * own.value)
         return (replace(own, standard_error=error),)
 
-    def strained(self, settings: Settings, values: Floats, standard_errors: Floats) -> bool:
-        """Return True if the shapes ask for weights that no machine has: the fit follows another effect."""
+    def has_implausible_shape(self, settings: Settings, values: Floats, standard_errors: Floats) -> bool:
+        """Return True if the shapes imply implausible weights: the fit then follows a different effect."""
         del settings
         most = _MOST_SIGMAS * (abs(values[0]) + _CHANCE * standard_errors[0])
         return bool((np.abs(values[1:]) > most + _CHANCE * standard_errors[1:]).any())
 
 
 class TorqueFamily(JointFamily):
-    """An effect at a revolute joint in whose load it lies alone."""
+    """An effect at a revolute joint that depends only on the load of this joint."""
 
-    goes_with = "torque"
+    load_kind = "torque"
     kind = "revolute"
 
     def needs(self, where: str) -> str:

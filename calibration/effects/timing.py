@@ -1,6 +1,6 @@
-"""Settings of effects in time: drifts since the first row of the training, and steps at one instant.
+"""Settings of effects in time: drifts since the first training row, and steps at one instant.
 
-The instants of steps lie between the rows, on a coarse grid first and then finely about one of them.
+The instants of steps lie between rows. A coarse grid is searched first, then a fine grid around one of its instants.
 """
 
 from __future__ import annotations
@@ -28,28 +28,28 @@ STEP_SETTINGS = ("time_s", "time_error_s", "span_s")
 
 _GRID = 40
 _FINE = 80
-_LEAST_SIDE = 0.05  # share of the rows on either side
+_LEAST_SIDE = 0.05  # smallest share of the rows on either side of a step
 _LEAST_ROWS = 3
 
 
 def drift_settings(time_s: Floats) -> Settings | None:
-    """Return the settings of a drift for the training rows' known times (m,); None if these are all the same."""
+    """Return the settings of a drift for the known times (m,) of the training rows; None if all are equal."""
     if len(time_s) == 0 or np.ptp(time_s) == 0.0:
         return None
     return {"from_s": float(time_s.min()), "span_s": float(np.ptp(time_s))}
 
 
 def check_drift(settings: Settings) -> None:
-    """Raise ValueError where the training took no time; all of `DRIFT_SETTINGS` are there."""
+    """Raise ValueError if the duration of the training is not positive; all `DRIFT_SETTINGS` must be present."""
     if settings["span_s"] <= 0.0:
         raise ValueError("the setting span_s is not above 0")
 
 
 def elapsed_s(context: EffectContext, settings: Settings) -> Floats:
-    """Return (n,) the time since the first row of the training; 0 where it is not known.
+    """Return the time (n,) since the first training row; 0 where it is not known.
 
-    No drift goes on for ever, and a model serves for months: before and after the training it is taken to go on for as
-    long again as that lasted, and to rest there.
+    A drift is extrapolated only for the duration of the training data, both before and after it, and is constant
+    beyond that, as drifts end and a model is used for months.
     """
     since = context.extra("time_s") - settings["from_s"]
     held: Floats = np.nan_to_num(np.clip(since, -settings["span_s"], 2.0 * settings["span_s"]))
@@ -57,17 +57,17 @@ def elapsed_s(context: EffectContext, settings: Settings) -> Floats:
 
 
 class StepFamily(Family):
-    """An effect from an instant on, its variants those of `step_grid` and `refined_steps`."""
+    """An effect that starts at an instant; the variants are the instants of `step_grid` and `refined_steps`."""
 
     column = "time_s"
-    shape_sigma = 0.03  # what has moved stays where it is
+    shape_sigma = 0.03  # small, as a moved part stays in its new place
 
     def odds(self, settings: Settings) -> float:
-        """Return the prior odds of an instant beside the others: the length of time that it stands for."""
+        """Return the prior odds of an instant relative to others: the length of time that it represents."""
         return settings["time_error_s"]
 
-    def settled(self, forms: Sequence[Settings], probability: Floats) -> Settings:
-        """Return the most probable step, with the standard deviation that all of them leave about its instant."""
+    def posterior_settings(self, forms: Sequence[Settings], probability: Floats) -> Settings:
+        """Return the most probable step, with the posterior standard deviation of its instant."""
         times, errors = (np.array([form[name] for form in forms]) for name in ("time_s", "time_error_s"))
         weight = probability * [self.odds(form) for form in forms]
         weight /= weight.sum()
@@ -78,13 +78,13 @@ class StepFamily(Family):
     def reported(
         self, settings: Settings, coefficients: tuple[FittedCoefficient, ...]
     ) -> tuple[FittedCoefficient, ...]:
-        plausible = settings["span_s"] / math.sqrt(12.0)  # anywhere between the first row and the last
+        plausible = settings["span_s"] / math.sqrt(12.0)  # uniform between the first and the last row
         instant = FittedCoefficient("time_s", "s", settings["time_s"], settings["time_error_s"], plausible)
         return (*coefficients, instant)
 
 
 class JointStepFamily(StepFamily, JointFamily):
-    """A joint whose zero is another one from an instant on; its one coefficient is the jump, rad or mm."""
+    """A joint whose zero changes at an instant; the only coefficient is the jump, rad or mm."""
 
     def variants(self, context: EffectContext, where: str) -> tuple[Settings, ...]:
         del where
@@ -105,20 +105,20 @@ class JointStepFamily(StepFamily, JointFamily):
         return self._in_readings(after.astype(np.float64))[:, None]
 
     def unknown_variance(self, values: Floats, plausible: Floats, settings: Settings) -> float:
-        """Return the mean square for rows as likely before the step as after it."""
+        """Return the mean square for rows that are equally likely before and after the step."""
         del plausible, settings
         return float(0.5 * self._in_readings(values[:1])[0] ** 2)
 
     def _in_readings(self, values: Floats) -> Floats:
-        """Return rad or mm as the unit of the joint's readings, deg or mm."""
+        """Convert rad or mm to the unit of the joint's readings, deg or mm."""
         return np.degrees(values) if self.kind == "revolute" else values
 
 
 class SizedStepFamily(StepFamily, SizedFamily):
-    """A base or a prism that stands elsewhere from an instant on."""
+    """A base or a prism that changes its place at an instant."""
 
     def time_s(self, context: EffectContext, where: str) -> Floats:
-        """Return the times (n,) of the rows that may show it, NaN in all others."""
+        """Return the times (n,) of the rows that the step may affect, NaN in all others."""
         del where
         return context.extra("time_s")
 
@@ -133,11 +133,11 @@ class SizedStepFamily(StepFamily, SizedFamily):
         check_step(settings)
 
     def after(self, context: EffectContext, where: str, settings: Settings) -> Floats:
-        """Return (n,) 1 in the rows after the step, 0 in those before; rows without a time stand as before."""
+        """Return (n,) 1 in the rows after the step and 0 before it; rows without a time count as before."""
         return (self.time_s(context, where) > settings["time_s"]).astype(np.float64)
 
     def sized(self, context: EffectContext, where: str, steps: Sequence[Settings]) -> tuple[Settings, ...]:
-        """Return steps together with the sizes of their columns."""
+        """Return the settings of steps with the RMS sizes of their columns added."""
         known = self.known(context, where)
         return tuple({**step, **sizes(self.shift_mm(context, where, step)[known])} for step in steps)
 
@@ -146,10 +146,10 @@ class _Instants(NamedTuple):
     """Instants midway between successive times of rows, with enough rows on either side.
 
     Attributes:
-        time_s: (m,) rising.
-        error_s: (m,) standard deviation of a step anywhere between the two rows.
-        before: (m,) number of rows before.
-        span_s: from the first row to the last.
+        time_s: (m,) instants, rising.
+        error_s: (m,) standard deviation of a uniformly distributed step between the two neighbouring times.
+        before: (m,) number of rows before each instant.
+        span_s: duration from the first row to the last.
     """
 
     time_s: Floats
@@ -159,7 +159,7 @@ class _Instants(NamedTuple):
 
     @classmethod
     def between(cls, time_s: Floats) -> _Instants:
-        """Find the instants between the known ones of times (n,)."""
+        """Return the instants between the known times among `time_s` (n,)."""
         known = np.sort(time_s[np.isfinite(time_s)])
         times, rows = np.unique(known, return_counts=True)
         before = np.cumsum(rows)[:-1].astype(np.float64)
@@ -170,12 +170,12 @@ class _Instants(NamedTuple):
         return cls((times[:-1] + gap / 2.0)[inside], (gap / math.sqrt(12.0))[inside], before[inside], span)
 
     def settings(self, index: int, least_error_s: float = 0.0) -> Settings:
-        """Return the settings of a step at one of them."""
+        """Return the settings of a step at one of the instants."""
         error = max(float(self.error_s[index]), least_error_s)
         return {"time_s": float(self.time_s[index]), "time_error_s": error, "span_s": self.span_s}
 
     def grid(self) -> list[int]:
-        """Choose the instants of a coarse search, with as many rows between any two, as nearly as possible."""
+        """Choose the instants of a coarse search, with about equal numbers of rows between them."""
         if len(self.time_s) <= _GRID:
             return list(range(len(self.time_s)))
         wanted = np.linspace(self.before[0], self.before[-1], _GRID)
@@ -184,9 +184,9 @@ class _Instants(NamedTuple):
 
 
 def step_grid(time_s: Floats) -> tuple[Settings, ...]:
-    """Return steps at quantiles of the rows' times; none where too few rows have a time.
+    """Return steps at quantiles of the rows' times; empty where too few rows have a time.
 
-    Each stands for those about it: its error is that of a step anywhere among them.
+    Each step represents the instants around it: its standard deviation includes them.
 
     Args:
         time_s: (n,) times of the rows, NaN where not known.
@@ -201,14 +201,14 @@ def step_grid(time_s: Floats) -> tuple[Settings, ...]:
 
 
 def refined_steps(time_s: Floats, settings: Settings) -> tuple[Settings, ...]:
-    """Return the steps about one of a grid's, between its neighbours; thinned out evenly where there are very many.
+    """Return the steps between the two neighbours of a grid step; thinned out evenly where there are very many.
 
     Args:
         time_s: (n,) times of the rows, NaN where not known.
         settings: the step of the grid.
 
     Returns:
-        None where the grid has all there are.
+        The steps; empty where the grid already contains all instants.
     """
     instants = _Instants.between(time_s)
     grid = instants.grid()
@@ -225,7 +225,7 @@ def refined_steps(time_s: Floats, settings: Settings) -> tuple[Settings, ...]:
 
 
 def check_step(settings: Settings) -> None:
-    """Raise ValueError for an instant that no search finds; all of `STEP_SETTINGS` are there."""
+    """Raise ValueError for settings that no search returns; all `STEP_SETTINGS` must be present."""
     negative = [name for name in ("time_error_s", "span_s") if settings[name] < 0.0]
     if negative:
         raise ValueError(f"the setting {negative[0]} is negative")

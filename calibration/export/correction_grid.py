@@ -16,7 +16,7 @@ from scipy.interpolate import RegularGridInterpolator
 
 from calibration.design.knowledge import setup_of
 from calibration.design.visibility import Bodies, Flags, is_reachable, site
-from calibration.effects.fitted import FittedEffect, left_out
+from calibration.effects.fitted import FittedEffect, missing_inputs
 from calibration.effects.library import library
 from calibration.errors import DataError
 from calibration.model.model import CalibratedModel
@@ -218,7 +218,7 @@ class Machine:
     def lacking(self, rows: Observations) -> tuple[FittedEffect, ...]:
         """Return the effects that move the machine and that lack an input in some of these rows."""
         context = Predictor.of(self.model).context(rows)
-        return tuple(effect for effect in self.effects if left_out([effect], context))
+        return tuple(effect for effect in self.effects if missing_inputs([effect], context))
 
     def rows(self, prism: str, readings: Floats) -> Observations:
         """Return observations of a prism at these joint values, without positions."""

@@ -1,1 +1,1 @@
-"""The gap workflow: where simulation and measurement disagree, which effect is missing, and what it closes."""
+"""The gap workflow: where simulation and measurement disagree, which effect is missing, and how much it explains."""

@@ -1,4 +1,4 @@
-"""Adoption of effects into a solution: those that the caller asks for by name, in their best forms."""
+"""Adoption of named effects into a solution, in their best variants."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from calibration.identification.refinement import Fit, Prior
 from calibration.identification.solve import Solution
 from calibration.observations import Observations
 
-_CHOICES = 4  # of variants: the noise that they are scored with depends on which are in
+_CHOICES = 4  # rounds of selecting variants, as the noise used for scoring depends on the selected ones
 
 
 @dataclass(frozen=True)
@@ -28,12 +28,12 @@ class Adopted:
     """Kinematics and effects together.
 
     Attributes:
-        solution: with the joint fit and its additions; that of the kinematics where no effect was adopted.
+        solution: solution with the joint fit and its additions; without effects, the solution of the kinematics.
         geometric: the fit of the kinematics alone.
-        effects: those that were adopted.
-        reason: why these, or why none, a clause.
-        warnings: sentences for people.
-        structured: True if the remaining errors are known to depend on something.
+        effects: the adopted effects.
+        reason: clause that explains the choice of effects, or why there are none.
+        warnings: sentences for the user.
+        structured: True if the remaining errors are known to be structured, not just noise.
     """
 
     solution: Solution
@@ -45,74 +45,83 @@ class Adopted:
 
 
 def adopt(solution: Solution, observations: Observations, effects: str, *, prior: Prior = "recalibration") -> Adopted:
-    """Adopt effects that are asked for by name.
+    """Adopt named effects.
 
     Args:
         solution: the kinematics alone, fitted to `observations`.
         observations: the rows.
         effects: `none`, or FAMILY@WHERE,...
-        prior: of the solution.
+        prior: prior of the solution.
 
     Raises:
         ValueError: as `parse_effects`.
-        DataError: an effect lacks a column, or cannot be at its place.
+        DataError: an effect lacks a column, or cannot occur at its place.
     """
     if effects == "none":
         return Adopted(solution, solution.fit)
-    situation = EffectContext(solution.chain, solution.fit.x[: len(solution.chain)], observations)
+    context = EffectContext(solution.chain, solution.fit.x[: len(solution.chain)], observations)
     names = parse_effects(effects, solution.chain.rig)
     for name, where in names:
         family = library()[name]
-        if family.known(situation, where).mean() < LEAST_KNOWN:
-            raise DataError("observations", f"{name}@{where} needs {family.needs(where)}, in half of the rows at least")
-        if not family.variants(situation, where):
-            raise DataError("observations", f"{name}@{where} cannot do anything in any pose; leave it out")
-    joint = _in_finest_forms(solution, _best_variants(solution, situation, names, prior), prior)
+        if family.known(context, where).mean() < LEAST_KNOWN:
+            raise DataError("observations", f"{name}@{where} needs {family.needs(where)}, in at least half of the rows")
+        if not family.variants(context, where):
+            raise DataError("observations", f"{name}@{where} has no effect in any pose; leave it out")
+    joint = _in_finest_forms(solution, _best_variants(solution, context, names, prior), prior)
     warnings = tuple(
-        f"{choice}: {name} came out beyond what is physical; it may stand for another effect"
+        f"{choice}: {name} is beyond its physical limits; it may stand for a different effect"
         for number, choice in enumerate(joint.choices)
-        for name in joint.beyond(number)
+        for name in joint.beyond_limits(number)
     )
-    return adopted(solution, joint, "asked for by name", warnings)
+    return adopted(solution, joint, "requested by name", warnings)
 
 
 def adopted(solution: Solution, joint: JointFit, reason: str, warnings: tuple[str, ...] = ()) -> Adopted:
-    """Return the solution of the kinematics alone with the effects of a joint fit."""
+    """Return the solution of the kinematics with the effects of a joint fit.
+
+    Args:
+        solution: the kinematics alone.
+        joint: the joint fit.
+        reason: as in `Adopted`.
+        warnings: as in `Adopted`.
+    """
     together = replace(solution, fit=joint.fit, additions=joint.additions)
     return Adopted(together, solution.fit, joint.effects, reason, warnings)
 
 
-def refined_choice(situation: EffectContext, choice: Choice, over: Projection) -> Choice:
-    """Return the finest form of an effect near the chosen one.
+def refined_choice(context: EffectContext, choice: Choice, over: Projection) -> Choice:
+    """Return the effect with refined settings near the chosen ones.
 
     Args:
-        situation: of the observations.
+        context: context of the observations.
         choice: the effect.
-        over: a projection that does not project it out.
+        over: a projection without this effect.
     """
-    finer = finer_forms(situation, choice)
+    finer = finer_forms(context, choice)
     if not finer:
         return choice
-    screen = Screen(over, [candidate_at(situation, over, choice.family, choice.where, finer)])
+    screen = Screen(over, [candidate_at(context, over, choice.family, choice.where, finer)])
     probability = softmax([screen.log_bayes_factor([(0, option)]) for option in range(len(finer))])
-    return replace(choice, settings=library()[choice.family].settled([c.settings for c in finer], probability))
+    return replace(
+        choice, settings=library()[choice.family].posterior_settings([c.settings for c in finer], probability)
+    )
 
 
-def finer_forms(situation: EffectContext, choice: Choice) -> tuple[Choice, ...]:
-    """Return finer forms of an effect near the given one, itself among them; none where there is nothing finer."""
-    finer = library()[choice.family].refined(situation, choice.where, choice.settings)
+def finer_forms(context: EffectContext, choice: Choice) -> tuple[Choice, ...]:
+    """Return finer variants of an effect near the given one, including it; empty if there are none."""
+    finer = library()[choice.family].refined(context, choice.where, choice.settings)
     return tuple(replace(choice, settings=settings) for settings in finer) if len(finer) > 1 else ()
 
 
 def _in_finest_forms(solution: Solution, joint: JointFit, prior: Prior) -> JointFit:
-    """Return the fit with each effect in its finest form, given the others."""
+    """Return the fit with each effect refined, given the others."""
     for choice in joint.choices:
-        if not finer_forms(joint.situation, choice):
+        if not finer_forms(joint.context, choice):
             continue
-        observations = joint.situation.observations
+        observations = joint.context.observations
         others = [c for c in joint.choices if c != choice]
         tried = joint_fit(solution, observations, [*others, choice], prior, joint.start([*others, choice]))
-        finer = refined_choice(tried.situation, choice, projected(solution, tried, without_last=True))
+        finer = refined_choice(tried.context, choice, projected(solution, tried, without_last=True))
         joint = joint_fit(
             solution, observations, [finer if c == choice else c for c in joint.choices], prior, joint.fit.x
         )
@@ -120,26 +129,26 @@ def _in_finest_forms(solution: Solution, joint: JointFit, prior: Prior) -> Joint
 
 
 def _best_variants(
-    solution: Solution, situation: EffectContext, names: Sequence[tuple[str, str]], prior: Prior
+    solution: Solution, context: EffectContext, names: Sequence[tuple[str, str]], prior: Prior
 ) -> JointFit:
-    """Fit the variants of the greatest joint evidence, changed one at a time until none is better."""
-    observations = situation.observations
-    variants = [variants_at(situation, name, where) for name, where in names]
+    """Fit the variants of maximum joint evidence, by changing one at a time until there is no improvement."""
+    observations = context.observations
+    variants = [variants_at(context, name, where) for name, where in names]
     chosen = [(0, 1.0)] * len(names)
     joint = joint_fit(solution, observations, _scaled(variants, chosen), prior)
     for _ in range(_CHOICES):
-        over = Projection(solution, joint.situation, joint.fit, joint.additions)
+        over = Projection(solution, joint.context, joint.fit, joint.additions)
         candidates = [
-            candidate_at(joint.situation, over, name, where, own)
+            candidate_at(joint.context, over, name, where, own)
             for (name, where), own in zip(names, variants, strict=True)
         ]
         screen, before = Screen(over, candidates), list(chosen)
         for _ in range(_CHOICES):
             start = list(chosen)
             for number, candidate in enumerate(candidates):
-                beside = screen.beside({at: one for at, one in enumerate(chosen) if at != number})
+                given = screen.given({at: one for at, one in enumerate(chosen) if at != number})
                 values = {
-                    (option, scale): beside.together(number, option, scale)
+                    (option, scale): given.together(number, option, scale)
                     + float(candidate.log_odds[option])
                     + LOG_SCALE_ODDS[scale]
                     for option, scale in itertools.product(range(len(candidate.options)), SCALES)

@@ -1,7 +1,7 @@
-"""Candidates: every effect of the library at every place where these data can show it, with its prior probability.
+"""Candidates: every effect of the library at every place where the data can reveal it, with its prior probability.
 
-Beforehand all families are equally likely, and all places of a family: an effect that a rig may have at seven joints is
-tried seven times and must not win by that.
+A priori all families are equally probable, and all places of a family: an effect that a rig may have at seven joints
+is tried seven times, which must not favour it.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from calibration.gap.projection import Projection
 from calibration.gap.rare_columns import without_zeros
 from calibration.observations import Floats
 
-LEAST_KNOWN = 0.5  # share of the rows that have what an effect needs
+LEAST_KNOWN = 0.5  # smallest share of rows in which the inputs of an effect must be known
 
 
 @dataclass(frozen=True)
@@ -29,11 +29,11 @@ class CandidateEffect:
     """An effect at one place of the machine, in all its variants.
 
     Attributes:
-        family, where: which effect, and at which joint, prism, `boom`, `base`, `station` or `clock`.
-        options: its o variants at this place.
-        additions: displacements of the samples by each variant.
+        family, where: family of the effect, and its place: a joint, prism, `boom`, `base`, `station` or `clock`.
+        options: the o variants at this place.
+        additions: columns of each variant for the samples.
         log_odds: (o,) log prior probability of each variant, given the candidate.
-        log_prior: log prior probability of the candidate among all.
+        log_prior: log prior probability of the candidate among all candidates.
     """
 
     family: str
@@ -48,7 +48,7 @@ class CandidateEffect:
 
     @cached_property
     def first_equal(self) -> tuple[int, ...]:
-        """(o,) for each variant the first one with the same columns; the two differ in their prior alone."""
+        """(o,) for each variant the index of the first one with equal columns; the two differ only in their priors."""
         every = self.additions
         return tuple(
             next((k for k in range(n) if every[k].sums == own.sums and same_columns(every[k], own)), n)
@@ -58,11 +58,11 @@ class CandidateEffect:
 
 @dataclass(frozen=True)
 class CandidateEffects:
-    """Effects of the library that these data can show, and why the others are none.
+    """Candidate effects of the library, and the reasons why other families are excluded.
 
     Attributes:
-        candidates: effects that these data can show.
-        disabled: family -> what the data or the rig lack for it.
+        candidates: effects that the data can reveal.
+        disabled: family -> reason for its exclusion.
     """
 
     candidates: tuple[CandidateEffect, ...]
@@ -70,7 +70,7 @@ class CandidateEffects:
 
 
 def candidate_effects(
-    situation: EffectContext,
+    context: EffectContext,
     over: Projection,
     families: Collection[str],
     without: Collection[str] = (),
@@ -79,18 +79,18 @@ def candidate_effects(
     """Return the candidates of the given families.
 
     Args:
-        situation: of the observations.
-        over: the projection to whose samples the columns belong.
-        families: names in the library.
-        without: `family@where` of the effects that are in the model already.
-        like: candidates about another fit, most of whose columns are the same.
+        context: context of the observations.
+        over: the projection whose samples the columns are for.
+        families: names of families in the library.
+        without: `family@where` of the effects that are already in the model.
+        like: candidates of an earlier fit, most of whose columns can be reused.
     """
-    found, disabled = _possible(situation, families, without)
+    found, disabled = _possible(context, families, without)
     alike = {(c.family, c.where): c for c in like}
     log_prior = _log_priors([name for name, _, _ in found], {name.partition("@")[0] for name in without})
     return CandidateEffects(
         tuple(
-            candidate_at(situation, over, name, where, choices, log_prior[name], alike.get((name, where)))
+            candidate_at(context, over, name, where, choices, log_prior[name], alike.get((name, where)))
             for name, where, choices in found
         ),
         disabled,
@@ -98,65 +98,70 @@ def candidate_effects(
 
 
 def each_candidate(
-    situation: EffectContext, over: Projection, families: Collection[str], like: Sequence[CandidateEffect] = ()
+    context: EffectContext, over: Projection, families: Collection[str], like: Sequence[CandidateEffect] = ()
 ) -> Iterator[CandidateEffect]:
-    """Yield the candidates of the given families, one at a time: all of them are gigabytes for thousands of fixes.
+    """Yield the candidates of the given families one at a time, as all together take gigabytes for thousands of fixes.
 
     Arguments are those of `candidate_effects`.
     """
-    found, _ = _possible(situation, families, ())
+    found, _ = _possible(context, families, ())
     alike = {(c.family, c.where): c for c in like}
     log_prior = _log_priors([name for name, _, _ in found], ())
     for name, where, choices in found:
-        yield candidate_at(situation, over, name, where, choices, log_prior[name], alike.get((name, where)))
+        yield candidate_at(context, over, name, where, choices, log_prior[name], alike.get((name, where)))
 
 
 def _possible(
-    situation: EffectContext, families: Collection[str], without: Collection[str]
+    context: EffectContext, families: Collection[str], without: Collection[str]
 ) -> tuple[list[tuple[str, str, tuple[Choice, ...]]], dict[str, str]]:
-    """Return family, place and variants of each effect that the data can show; why they cannot show the others."""
+    """Return (family, place, variants) of each effect that the data can reveal, and family -> reason of exclusion."""
     found: list[tuple[str, str, tuple[Choice, ...]]] = []
     disabled: dict[str, str] = {}
     for name in sorted(families):
         family = library()[name]
-        places = family.places(situation.rig)
-        known = [where for where in places if family.known(situation, where).mean() >= LEAST_KNOWN]
-        here = [
-            (name, where, variants_at(situation, name, where)) for where in known if f"{name}@{where}" not in without
-        ]
+        places = family.places(context.rig)
+        known = [where for where in places if family.known(context, where).mean() >= LEAST_KNOWN]
+        here = [(name, where, variants_at(context, name, where)) for where in known if f"{name}@{where}" not in without]
         if not places:
-            disabled[name] = f"rig {situation.rig.name!r} has no place for it"
+            disabled[name] = f"rig {context.rig.name!r} has no place for it"
         elif not known:
             disabled[name] = f"needs {family.needs(places[0])}"
         elif here and not any(choices for _, _, choices in here):
-            disabled[name] = "these poses show nothing of it"
+            disabled[name] = "it has no effect in these poses"
         found += [one for one in here if one[2]]
     return found, disabled
 
 
-def partly_known(situation: EffectContext, families: Collection[str]) -> Iterator[str]:
-    """Yield a sentence for each need that most rows lack and some have: what goes by it may bear another name."""
+def partly_known(context: EffectContext, families: Collection[str]) -> Iterator[str]:
+    """Yield a sentence for each input that some but fewer than half of the rows have.
+
+    Effects with such inputs are not candidates, and their errors may be attributed to other effects.
+
+    Args:
+        context: context of the observations.
+        families: names of the families to check.
+    """
     lacking: dict[tuple[str, int], list[str]] = {}
     for name in sorted(families):
         family = library()[name]
-        for where in family.places(situation.rig):
-            known = family.known(situation, where)
+        for where in family.places(context.rig):
+            known = family.known(context, where)
             if 0.0 < known.mean() < LEAST_KNOWN:
                 need = family.needs(where), int(known.sum())
                 lacking.setdefault(need, []).append(f"{name}@{where}")
     for (needs, rows), names in lacking.items():
         yield (
-            f"not looked for: {', '.join(names)}; it needs {needs}, which {rows} of {len(situation)} rows have, fewer "
-            "than half: what these do may be told under another name"
+            f"not looked for: {', '.join(names)}; needs {needs}, which {rows} of {len(context)} rows have, fewer than "
+            "half: these effects may be reported under a different name"
         )
 
 
 def _log_priors(names: Sequence[str], again: Collection[str]) -> dict[str, float]:
-    """Return the log prior probability of one candidate of each family; families of `again` share half of it all.
+    """Return family -> log prior probability of each of its candidates; families of `again` share one half.
 
     Args:
         names: the family of every candidate.
-        again: families that are in the model already.
+        again: families that are already in the model.
     """
     count = {name: names.count(name) for name in names}
     twice = sum(name in again for name in count)
@@ -168,7 +173,7 @@ def _log_priors(names: Sequence[str], again: Collection[str]) -> dict[str, float
 
 
 def candidate_at(
-    situation: EffectContext,
+    context: EffectContext,
     over: Projection,
     family: str,
     where: str,
@@ -176,25 +181,35 @@ def candidate_at(
     log_prior: float = 0.0,
     like: CandidateEffect | None = None,
 ) -> CandidateEffect:
-    """Return the candidate with the given variants; columns that are equal to those of one `like` it are these."""
+    """Return the candidate with the given variants; equal columns of `like` are reused.
+
+    Args:
+        context: context of the observations.
+        over: the projection whose samples the columns are for.
+        family: family of the effect.
+        where: place of the effect.
+        choices: variants of the effect.
+        log_prior: log prior probability of the candidate.
+        like: the same candidate of an earlier fit.
+    """
     odds = np.array([library()[family].odds(choice.settings) for choice in choices])
     return CandidateEffect(
         family,
         where,
         tuple(choices),
-        sharing((_columns(choice, situation, over, like) for choice in choices), like.additions if like else ()),
+        sharing((_columns(choice, context, over, like) for choice in choices), like.additions if like else ()),
         np.log(odds / odds.sum()),
         log_prior,
     )
 
 
-def _columns(choice: Choice, situation: EffectContext, over: Projection, like: CandidateEffect | None) -> EffectColumns:
-    """Return the columns of a variant: those of the same variant about another fit, where no fit changes them."""
-    if like is not None and choice in like.options and library()[choice.family].goes_by_readings:
+def _columns(choice: Choice, context: EffectContext, over: Projection, like: CandidateEffect | None) -> EffectColumns:
+    """Return the columns of a variant, reusing those of an earlier fit where they do not depend on the fit."""
+    if like is not None and choice in like.options and library()[choice.family].depends_on_readings_only:
         return like.additions[like.options.index(choice)]
-    return without_zeros(choice.columns(situation).over(over.samples.average))
+    return without_zeros(choice.columns(context).over(over.samples.average))
 
 
-def variants_at(situation: EffectContext, family: str, where: str) -> tuple[Choice, ...]:
-    """Return the variants of an effect at a place; none where it cannot do anything there."""
-    return tuple(Choice(family, where, settings) for settings in library()[family].variants(situation, where))
+def variants_at(context: EffectContext, family: str, where: str) -> tuple[Choice, ...]:
+    """Return the variants of an effect at a place; empty if it cannot occur there."""
+    return tuple(Choice(family, where, settings) for settings in library()[family].variants(context, where))

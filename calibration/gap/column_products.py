@@ -1,8 +1,8 @@
-"""Products of the columns of effects in a projected space, each computed when it is asked for.
+"""Products of the columns of effects in a projected space, each computed on first use.
 
-An effect of a joint moves the prism of a sample by the value of its column there, times what a unit of that joint's
-reading does, which is the same for all effects of the joint. A curve of hundreds of splines touches four of them in a
-sample: its products need these four values and none of the zeros.
+An effect of a joint displaces the prism of a sample by the value of its column times the displacement per unit of the
+joint's reading, which is the same for all effects of the joint. Of hundreds of splines of a curve, only four are
+nonzero in a sample, and products use only these four values.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from calibration.gap.projection import Projection
 from calibration.gap.rare_columns import RareColumns
 from calibration.observations import Floats
 
-_AT_ONCE = 64  # columns
-_KEPT = 20_000_000  # values of variants' rows that are cached; all are gigabytes where there are thousands of fixes
+_AT_ONCE = 64  # columns per batch
+_KEPT = 20_000_000  # largest number of cached values; all of them would be gigabytes for thousands of fixes
 
 
 class BlockProducts(Protocol):
@@ -36,13 +36,13 @@ class BlockProducts(Protocol):
 
 @dataclass(frozen=True)
 class _AtJoint:
-    """Effects of a unit of a joint's reading on each of m samples.
+    """Displacements of each of m samples per unit of a joint's reading.
 
     Attributes:
-        whitened: (3 m, m) displacements.
-        transposed: (m, 3 m) the same.
-        removed: (m, q) their part along the kinematics.
-        along: (m,) their products with the target.
+        whitened: (3 m, m) whitened displacements.
+        transposed: (m, 3 m) the transposed matrix.
+        removed: (m, q) components along the kinematics.
+        along: (m,) products with the target.
     """
 
     whitened: csr_array
@@ -89,7 +89,7 @@ class ProjectedProducts:
         return self._gram[a, b]
 
     def _add(self, numbers: Sequence[int]) -> None:
-        """Add blocks of columns that are mostly not zero: one pass over the rows serves them all."""
+        """Add blocks of dense columns, in a single pass over the rows."""
         projection = self._projection
         together = joined([self._blocks[number] for number in numbers], len(projection.samples))
         whitened = projection.whitened(projection.moved_mm(together))
@@ -99,28 +99,28 @@ class ProjectedProducts:
         each = (np.split(whitened, edges, axis=1), np.split(removed, edges, axis=1), np.split(along, edges))
         for number, rows, own, own_along in zip(numbers, *each, strict=True):
             self._gram[number, number] = rows.T @ rows - own.T @ own
-            # A part of an array would keep the whole in memory.
+            # Copy, as a view would keep the whole array in memory.
             self._removed[number], self._along[number] = own.copy(), own_along
 
     def _whole_product(self, a: int, b: int) -> Floats:
-        """Return (k, l) the products of the whitened columns of two blocks, nothing projected out."""
+        """Return (k, l) the products of the whitened columns of two blocks, without projection."""
         rare_a, rare_b = self._rare[a], self._rare[b]
         if rare_a is None:
             return self._whitened(a).T @ self._whitened(b) if rare_b is None else self._whole_product(b, a).T
         if rare_b is None:
             return np.asarray(rare_a.T @ (self._at(a).transposed @ self._whitened(b)))
-        # SciPy would first make the larger one's format that of the transposed one.
+        # Convert explicitly, as SciPy would otherwise convert the larger matrix to the format of the transposed one.
         return np.asarray((rare_a.T.tocsr() @ (self._between(a, b) @ rare_b)).toarray())
 
     def _between(self, a: int, b: int) -> csr_array:
-        """Return (m, m) the products of displacements by a unit of reading at the joints of two blocks."""
+        """Return (m, m) the products of displacements per unit of reading at the joints of two blocks."""
         joints = int(self._blocks[a].joint[0]), int(self._blocks[b].joint[0])
         if joints not in self._between_joints:
             self._between_joints[joints] = self._at(a).transposed @ self._at(b).whitened
         return self._between_joints[joints]
 
     def _at(self, block: int) -> _AtJoint:
-        """Return what a unit of the reading does at the joint of a block with rare columns."""
+        """Return the displacements per unit of reading at the joint of a block with rare columns."""
         joint = int(self._blocks[block].joint[0])
         if joint not in self._at_joint:
             projection = self._projection
@@ -146,7 +146,7 @@ class ProjectedProducts:
 
 
 def _batches(blocks: Sequence[EffectColumns], numbers: Sequence[int]) -> Iterator[Sequence[int]]:
-    """Yield numbers of blocks in batches of some columns, wider ones alone."""
+    """Yield numbers of blocks in batches of at most `_AT_ONCE` columns; wider blocks alone."""
     width = itertools.accumulate(len(blocks[number]) for number in numbers)
     batch = list[int]()
     first = 0

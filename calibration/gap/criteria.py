@@ -1,8 +1,8 @@
 """Criteria by which an effect is named: its evidence, its alternatives, and its stability under resampling.
 
-The posterior alone is conditional on the library, the noise and the linear model. Half-samples and held-out groups ask
-the data themselves, after projecting out the kinematics that all of them determine: half of a few poses determines
-none.
+The posterior alone is conditional on the library, the noise and the linear model. Half-samples and held-out groups test
+the effect on the data themselves. They use data with the kinematics of the full data set projected out, as half of a
+few poses would not determine the kinematics.
 """
 
 from __future__ import annotations
@@ -26,29 +26,34 @@ from calibration.numerics.statistics import chance_of_mean
 from calibration.observations import Floats
 from calibration.residual.folds import folds
 
-_ODDS, _FURTHER_ODDS = math.log(19.0), math.log(999.0)  # for a first effect, and for a further one
-_CHANCE, _FURTHER_CHANCE = 0.01, 0.003  # p-values, corrected for the number of candidates, of a first and a further one
-NEAR = 5.0  # log Bayes factor: families this near are not told apart
-_PLAIN = 100.0  # log Bayes factor beyond any doubt
+_ODDS, _FURTHER_ODDS = math.log(19.0), math.log(999.0)  # log odds required of a first effect and of a further one
+_CHANCE, _FURTHER_CHANCE = 0.01, 0.003  # the same for p-values, corrected for the number of candidates
+NEAR = 5.0  # difference of log Bayes factors below which families are not distinguishable
+_PLAIN = 100.0  # log Bayes factor from which on an effect is certain
 _EQUAL = math.log(19.0)  # log odds at which an alternative has a posterior of 0.05
-_POSSIBLE = 0.02  # posterior of an alternative
-_BOTH = 1.1  # sum of the posteriors of two effects that are both there
-_RELEVANT = 0.1  # of the leading log Bayes factor: less is neither like it nor seen in addition to it
-_COMPARED = 30  # candidates at least
-_SAME_FAMILY = 2  # forms and places of a family that a plan tells from the others as well
+_POSSIBLE = 0.02  # posterior from which on an effect is a possible alternative
+_BOTH = 1.1  # sum of the posteriors of two effects from which on both are present
+_RELEVANT = 0.1  # share of the leading log Bayes factor below which a candidate is irrelevant to the leading one
+_COMPARED = 30  # smallest number of candidates to compare
+_SAME_FAMILY = 2  # other variants and places of a family that a plan also distinguishes from other effects
 _HALF_SAMPLES = 25
 _FOLDS = 10
 
 
 def promising(scored: Sequence[ScoredEffect]) -> list[CandidateEffect]:
-    """Return the candidates that may matter to the leading one; those like it or added to it stand out as well."""
+    """Return the candidates that may be alternatives or additions to the leading one, as they stand out themselves."""
     order = sorted(scored, key=lambda w: -w.log_bayes_factor)
     least = _RELEVANT * scored[0].log_bayes_factor
     return [w.candidate for i, w in enumerate(order) if i < _COMPARED or w.log_bayes_factor > least or w is scored[0]]
 
 
 def further_places(screen: Screen, scored: Sequence[ScoredEffect]) -> list[ScoredEffect]:
-    """Return further places where the leading family is beyond any doubt, given that it is at the leading one."""
+    """Return further places where the leading family is certain, given that it is at the leading place.
+
+    Args:
+        screen: products of the candidates.
+        scored: the scored candidates, the leading one first.
+    """
     leading, found = scored[0], list[ScoredEffect]()
     for w in sorted(scored[1:], key=lambda w: -w.log_bayes_factor):
         own = w.candidate
@@ -64,36 +69,47 @@ def further_places(screen: Screen, scored: Sequence[ScoredEffect]) -> list[Score
     return found
 
 
-def may_stand_out(scored: Sequence[ScoredEffect]) -> bool:
-    """True if any candidate beats the no-effect model at that model's noise."""
+def has_positive_evidence(scored: Sequence[ScoredEffect]) -> bool:
+    """Return True if any candidate beats the no-effect model at that model's noise."""
     return max(w.log_bayes_factor + w.candidate.log_prior for w in scored) > 0.0
 
 
-def stands_out(leading: ScoredEffect, log_bayes_factor: float, tested: int, *, is_further: bool) -> bool:
-    """True if an effect is there: by its evidence, and by the p-value of what it explains.
+def is_significant(leading: ScoredEffect, log_bayes_factor: float, tested: int, *, is_further: bool) -> bool:
+    """Return True if an effect is significant, by its evidence and by the p-value of the squares it explains.
 
     Args:
-        leading: the most probable candidate, scored with the noise that it leaves.
-        log_bayes_factor: of it against no effect, each with the noise that it leaves.
+        leading: the most probable candidate, scored with its own residual noise.
+        log_bayes_factor: log Bayes factor of it against no effect, each with its own residual noise.
         tested: number of candidates.
-        is_further: something is adopted already. Every further test is another chance of a false alarm, and an effect
-            that does not quite fit leaves traces that look like others.
+        is_further: True if an effect is already adopted. The criteria are then stricter, as every test may raise a
+            false alarm, and as an imperfect fit of an effect leaves residuals that resemble other effects.
     """
     odds, chance = (_FURTHER_ODDS, _FURTHER_CHANCE) if is_further else (_ODDS, _CHANCE)
     return log_bayes_factor + leading.candidate.log_prior > odds and leading.p * tested < chance
 
 
-def stands_for(scored: ScoredEffect, formula: Formula, over: Projection) -> bool:
-    """True if an effect does what a formula says, though the formula explains the data better.
+def is_equivalent(scored: ScoredEffect, formula: Formula, over: Projection) -> bool:
+    """Return True if an effect is equivalent to a formula, even if the formula explains the data better.
 
-    The effect may explain as much with more coefficients than these data ask for, at the same place; a simpler error of
-    another place that explains more is something else.
+    The effect must be at the same place and explain as much, possibly with more coefficients than these data require. A
+    simpler error at a different place that explains more is not equivalent.
+
+    Args:
+        scored: the effect.
+        formula: the formula.
+        over: the projection in which they are compared.
     """
     return scored.candidate.where == formula.term.source.where and explains(scored, formula, over)
 
 
 def explains(scored: ScoredEffect, formula: Formula, over: Projection) -> bool:
-    """True if the data do not ask for a formula in addition to an effect."""
+    """Return True if the data do not require a formula in addition to an effect.
+
+    Args:
+        scored: the effect.
+        formula: the formula.
+        over: the projection in which they are compared.
+    """
     additions = scored.scaled_additions
     columns = over.columns(over.moved_mm(additions)) * additions.prior_sigma
     return not formula.adds_to(columns, over.residual)
@@ -118,13 +134,19 @@ def near_alternatives(scored: Sequence[ScoredEffect]) -> list[ScoredEffect]:
 
 
 def is_near(leading: ScoredEffect, other: ScoredEffect) -> bool:
-    """True if `other` could be the true effect instead of `leading`, and is not there in addition to it."""
+    """Return True if `other` could be the true effect instead of `leading`, rather than in addition to it."""
     near = other.log_bayes_factor > leading.log_bayes_factor - NEAR or other.posterior > _POSSIBLE
     return near and other.posterior + leading.posterior < _BOTH
 
 
 def with_same_family(alternative: ScoredEffect, screen: Screen, scored: Sequence[ScoredEffect]) -> ScoredEffect:
-    """Return one of a set with the other forms and places of its family that could be true, the most probable first."""
+    """Return an alternative with the other possible variants and places of its family, the most probable first.
+
+    Args:
+        alternative: one effect of a set that cannot be distinguished.
+        screen: products of the candidates.
+        scored: all scored candidates, the leading one first.
+    """
     least = scored[0].log_bayes_factor - NEAR
     elsewhere = [w for w in scored if w.candidate.family == alternative.candidate.family and w is not alternative]
     near = [w for w in elsewhere if w.log_bayes_factor >= least and is_near(scored[0], w)]
@@ -132,17 +154,17 @@ def with_same_family(alternative: ScoredEffect, screen: Screen, scored: Sequence
     return replace(alternative, same_family=tuple(others[:_SAME_FAMILY]))
 
 
-def beyond_doubt(best: Sequence[ScoredEffect]) -> bool:
-    """True if the leading effect is plain and no other family comes near, by the best of each family."""
+def is_certain(best: Sequence[ScoredEffect]) -> bool:
+    """Return True if the leading effect is certain and no other family is near, by the best of each family."""
     leading, *others = (w.log_bayes_factor for w in best)
     return leading > max([_PLAIN, *(other + 2 * NEAR for other in others)])
 
 
-def as_simple(leading: ScoredEffect, alternative: ScoredEffect) -> bool:
-    """True if an alternative explains the data nearly as well with no more coefficients.
+def is_as_simple(leading: ScoredEffect, alternative: ScoredEffect) -> bool:
+    """Return True if an alternative explains the data nearly as well with no more coefficients.
 
-    Its prior probability is no evidence, neither by the number of its places nor by the size that it asks for. That
-    something simpler explains as much as a part of the leading effect is.
+    Prior probabilities do not count here, neither those of places nor those of sizes. It counts that a simpler effect
+    explains the data as well as the leading effect.
     """
     better = leading.log_bayes_factor - alternative.log_bayes_factor
     fits_better = leading.log_likelihood - alternative.log_likelihood
@@ -150,11 +172,19 @@ def as_simple(leading: ScoredEffect, alternative: ScoredEffect) -> bool:
 
 
 def with_finer(
-    candidate: CandidateEffect, option: int, choice: Choice, over: Projection, situation: EffectContext
+    candidate: CandidateEffect, option: int, choice: Choice, over: Projection, context: EffectContext
 ) -> CandidateEffect:
-    """Return a candidate with a finer form of one of its variants added, at that form's own prior odds."""
+    """Return a candidate with a finer variant added, at the prior odds of that variant.
+
+    Args:
+        candidate: the candidate.
+        option: index of the variant that was refined.
+        choice: the finer variant.
+        over: the projection whose samples the columns are for.
+        context: context of the observations.
+    """
     choice, family = replace(choice, scale=1.0), library()[candidate.family]
-    additions = choice.columns(situation).over(over.samples.average)
+    additions = choice.columns(context).over(over.samples.average)
     log_odds = math.log(family.odds(choice.settings) / family.odds(candidate.options[option].settings))
     return replace(
         candidate,
@@ -165,7 +195,7 @@ def with_finer(
 
 
 def odds_text(best: ScoredEffect, other: ScoredEffect) -> str:
-    """Return a clause: how much better the best explains the data than another."""
+    """Return a clause that states by what factor the best candidate explains the data better than another."""
     log_odds = best.log_bayes_factor - other.log_bayes_factor
     times = f"e^{log_odds:.0f}" if log_odds > math.log(1000.0) else f"{math.exp(max(log_odds, 0.0)):.0f}"
     return f"{best.candidate} explains the data {times} times better"
@@ -176,16 +206,18 @@ def half_sample_wins(
 ) -> dict[str, float]:
     """Return the share of half-samples, drawn by group, in which each family has the greatest evidence.
 
-    A likely partner of the first candidate is added to each of them. Both halves share the cost of not knowing a form.
+    A probable partner of the first candidate is added to each of them. The penalty for averaging over variants is split
+    between both halves.
 
     Args:
-        projection: about the fit.
-        family: the candidate, and other places of its family that come near.
-        alternatives: those of other families that come near; no effect is an alternative too.
-        seed: of the halves.
+        projection: projection at the fit.
+        family: the candidate, and near candidates of its family at other places.
+        alternatives: near candidates of other families; no effect is an alternative too.
+        seed: random seed of the halves.
 
     Returns:
-        `family@where` -> share, the greatest first, of all that win any; the family by the name of the candidate.
+        `family@where` -> share, greatest first, for all candidates that win any half-sample; wins of `family` count for
+        its first candidate.
     """
     scored = [*family, *alternatives]
     left = _whitened(projection, family[0], scored)
@@ -210,7 +242,12 @@ def half_sample_wins(
 def cross_validation_p(projection: Projection, scored: ScoredEffect, seed: int) -> float:
     """Return the p-value of an effect's predictions of held-out groups (t-test, one-sided).
 
-    Of a few groups that have all of the evidence none predicts the others.
+    It is not significant if a few groups have all of the evidence, as none of them is predicted by the others.
+
+    Args:
+        projection: projection at the fit.
+        scored: the effect.
+        seed: random seed of the folds.
     """
     left = _whitened(projection, scored, [scored])
     columns, target = left[:, :-1], left[:, -1]
@@ -223,13 +260,13 @@ def cross_validation_p(projection: Projection, scored: ScoredEffect, seed: int) 
     return chance_of_mean(np.bincount(group, along).astype(np.float64))
 
 
-def beyond(situation: EffectContext, scored: ScoredEffect) -> tuple[str, ...]:
-    """Return names of the coefficients whose linear estimate is beyond their hard limits by more than chance."""
-    return scored.choice.beyond(situation, scored.estimate, scored.standard_error)
+def beyond_limits(context: EffectContext, scored: ScoredEffect) -> tuple[str, ...]:
+    """Return the names of the coefficients whose linear estimate exceeds the hard limits significantly."""
+    return scored.choice.beyond_limits(context, scored.estimate, scored.standard_error)
 
 
 def _whitened(projection: Projection, leading: ScoredEffect, scored: Sequence[ScoredEffect]) -> Floats:
-    """Return (3 m, k + 1) columns of several effects and the target, without kinematics and the first's partner."""
+    """Return (3 m, k + 1) columns of effects, and the target, with kinematics and the leading partner projected out."""
     columns = [_columns(projection, w) for w in scored]
     without = projection.without_kinematics
     if leading.partner is not None:

@@ -1,13 +1,13 @@
-"""Detection: tests of whether simulation and measurement disagree beyond chance, and on what that depends.
+"""Detection: tests of whether simulation and measurement disagree beyond chance, and on which variables it depends.
 
-The test of every term is its score. What scores are like by chance the residuals say themselves: with the signs of
-whole groups of samples drawn at random (wild bootstrap: Wu, Annals of Statistics 14, 1986; score tests by sign flips:
-Hemerik, Goeman and Finos, JRSS B 82, 2020) they keep their sizes from source to source, their outliers and what they
-share with their neighbours, and lose only what depends on anything. Each of the many terms is held to the largest
-score of every draw (Westfall and Young 1993), and so pays for all tests, however alike they are.
+The test statistic of every term is its score. The null distribution of the scores is obtained from the residuals with
+the signs of whole groups of samples drawn at random (wild bootstrap: Wu, Annals of Statistics 14, 1986; score tests by
+sign flips: Hemerik, Goeman and Finos, JRSS B 82, 2020). Sign flips preserve the sizes of the residuals, their outliers
+and the correlation of neighbours, and remove only dependence on variables. Each of the many terms is compared with the
+largest score of every draw (Westfall and Young 1993), which corrects for all tests, however correlated they are.
 
-Errors far smaller than the noise that the fixes are said to have are no disagreement: they show how build tolerances
-hold a fit that is looser than it need be.
+Errors far smaller than the stated noise of the fixes are not a disagreement. They only reflect that build tolerances
+constrain a fit more than its noise requires.
 """
 
 from __future__ import annotations
@@ -28,22 +28,22 @@ from calibration.gap.result import Disagreement
 from calibration.numerics.statistics import chance_beyond
 from calibration.observations import Floats
 
-FAR = 1e-12  # p-value of the remaining errors, below which neither one effect nor a few more will explain them
+FAR = 1e-12  # p-value of the residuals below which no single effect, nor a few more, will explain them
 _DRAWS = 999
-_ENOUGH = 10  # draws beyond a score, of which a share is a probability; with fewer a tail goes on from there
-_QUIET = 0.45  # of the noise that the fixes are said to have
-_ALARM = 0.005  # half of what false alarms may be: the library may raise some too
+_ENOUGH = 10  # draws beyond a score required for an empirical p-value; with fewer, a tail is extrapolated
+_QUIET = 0.45  # RMS of the residuals, relative to the stated noise, below which there is no disagreement
+_ALARM = 0.005  # half of the allowed false alarm rate, as the effects of the library may raise false alarms too
 _LISTED = 0.05
 _MOST = 10
-# Of the chance of a false alarm: what the largest score of each kind of term has, what all scores together have, and
-# what neighbours share along each of three variables.
+# Shares of the false alarm rate: of the largest score of each kind of term, of the sum of all scores, and of neighbour
+# tests along each of three variables.
 _LARGEST: Mapping[Kind, float] = {"single": 0.4, "crossing": 0.15, "product": 0.15}
 _TOGETHER = 0.15
 _NEIGHBOURS = 0.05
 
 _NEAREST = 4
-_WANDERS = 0.1  # share of the variance that noise may share with its neighbours: air, a tripod in the sun
-_LEAST = 30  # pairs
+_CORRELATED = 0.1  # share of the noise variance that neighbours may have in common: air, a tripod in the sun
+_LEAST = 30  # smallest number of pairs
 _LEAST_MM = 1e-6
 
 
@@ -52,9 +52,9 @@ class Detection:
     """Result of the tests.
 
     Attributes:
-        p: p-value of all scores together, where nothing is missing.
-        disagreements: source and variable, the most significant first, each p corrected for all tests; values far
-            smaller than one in a thousand are the tail of a normal number and only rank them.
+        p: p-value of all tests together, under the hypothesis that nothing is missing.
+        disagreements: source and variable, the most significant first, each with a p-value corrected for all tests.
+            Values far below 1/1000 are from an extrapolated normal tail and are useful only for ranking.
     """
 
     p: float
@@ -67,11 +67,11 @@ class Detection:
 
 
 def detect(grammar: Grammar, rng: np.random.Generator) -> Detection:
-    """Test everything that the grammar has words for.
+    """Test all terms of the grammar, and the correlation of neighbours.
 
     Args:
         grammar: the terms and their scores.
-        rng: draws the signs.
+        rng: random generator for the signs.
     """
     is_quiet = float(np.mean(grammar.projection.residual**2)) < _QUIET**2
     if is_quiet or not grammar.terms:
@@ -86,7 +86,7 @@ def detect(grammar: Grammar, rng: np.random.Generator) -> Detection:
         own = kinds == kind
         if own.any():
             p[own] = _p_of_largest(scores[own], chance[:, own].max(axis=1)) / share
-    least = 0.5 ** (groups - 1)  # as often all signs agree
+    least = 0.5 ** (groups - 1)  # probability that all signs agree
     p = np.clip(p, least, 1.0)
     together = max(_p_of_sum(float(scores @ scores), (chance**2).sum(axis=1)) / _TOGETHER, least)
     listed: dict[tuple[str, str], Disagreement] = {}
@@ -98,7 +98,7 @@ def detect(grammar: Grammar, rng: np.random.Generator) -> Detection:
     alarm = min(float(p.min()), together)
     if alarm < _ALARM:
         return Detection(alarm, tuple(listed.values()))
-    for along in neighbour_tests(grammar.projection, rng, _DRAWS):  # for what no term has words for
+    for along in neighbour_tests(grammar.projection, rng, _DRAWS):  # for errors that no term describes
         alike = max(_p_of_sum(along.shared, along.chance * lost**2) / _NEIGHBOURS, least)
         alarm = min(alarm, alike)
         if alike < _LISTED:
@@ -107,10 +107,10 @@ def detect(grammar: Grammar, rng: np.random.Generator) -> Detection:
 
 
 def _sign_flip_factor(grammar: Grammar) -> float:
-    """Return the factor that makes residuals with flipped signs as large as the noise.
+    """Return the factor that scales residuals with flipped signs to the size of the noise.
 
-    The fit of the kinematics takes some directions out of the residuals, in which an effect's column has nothing: its
-    score is none the smaller for it, but with flipped signs the rest is spread over all directions.
+    The fit of the kinematics removes some directions from the residuals. An effect's column has no component in them,
+    so its score is not reduced. With flipped signs, however, the residuals are spread over all directions.
     """
     projection = grammar.projection
     taken = projection.without_kinematics.degrees_of_freedom
@@ -122,14 +122,14 @@ def _p_of_largest(scores: Floats, chance: Floats) -> Floats:
     ordered = np.sort(chance)
     beyond = len(ordered) - np.searchsorted(ordered, scores, side="left")
     share = (beyond + 1.0) / (len(ordered) + 1.0)
-    # The tail of the largest of many normal numbers is proportional to that of one.
+    # The tail of the maximum of many normal numbers is proportional to that of a single one.
     edge = float(log_ndtr(-ordered[-_ENOUGH]))
     tail = np.exp(np.minimum(log_ndtr(-scores) - edge, 0.0)) * (_ENOUGH + 1.0) / (len(ordered) + 1.0)
     return np.where(beyond >= _ENOUGH, share, np.minimum(tail, share))
 
 
 def _p_of_sum(total: float, chance: Floats) -> float:
-    """Return the p-value of a sum of squares against those of the draws (draws,), whose tail is a gamma one."""
+    """Return the p-value of a sum of squares against those of the draws (draws,), with a gamma tail."""
     beyond = int((chance >= total).sum())
     share = (beyond + 1.0) / (len(chance) + 1.0)
     if beyond >= _ENOUGH:
@@ -142,9 +142,9 @@ class NeighbourTest:
     """Products of neighbours' residuals along one variable.
 
     Attributes:
-        where, variable: source and variable, as of a disagreement.
-        shared: products of the residuals of neighbours, summed, beyond what noise may share.
-        chance: (draws,) the same where neighbours have nothing in common.
+        where, variable: source and variable, as for a disagreement.
+        shared: sum of the products of neighbours' residuals, minus what correlated noise explains.
+        chance: (draws,) the sums for random signs, without correlation of neighbours.
     """
 
     where: str
@@ -154,27 +154,30 @@ class NeighbourTest:
 
 
 def neighbour_tests(projection: Projection, rng: np.random.Generator, draws: int) -> Iterator[NeighbourTest]:
-    """Test whether errors go together in neighbouring samples, whatever the formula.
+    """Test whether errors of neighbouring samples are correlated, independent of any formula.
 
-    Terms find what they have words for. An error that swings with the time, ripples with the range or sits in one
-    corner of the work volume may have none and look like noise that is larger than it should be; but noise is
-    independent from sample to sample, and an error that depends on something varies slowly with it. Neighbours are
-    taken along the time, along the range (errors along the line of sight), and in the work volume; pairs within a group
-    are left out: fixes of a standstill share the errors of its readings.
+    Terms only find errors that they describe. An error that oscillates with time, ripples with the range or occurs in
+    one corner of the work volume may match no term and look like excess noise. However, noise is independent from
+    sample to sample, while an error that depends on a variable changes slowly with it. Neighbours are taken along time,
+    along the range (errors along the line of sight), and in the work volume. Pairs within a group are left out, as
+    fixes of a standstill share the errors of its readings.
 
     Args:
-        projection: whose residual.
-        rng: draws the signs of groups.
-        draws: how often.
+        projection: the projection with the residual.
+        rng: random generator for the signs of groups.
+        draws: number of draws.
+
+    Yields:
+        The result for each of the three variables.
     """
     residual = projection.residual.reshape(-1, 3)
     groups, group = np.unique(projection.groups, return_inverse=True)
     signs = 2.0 * rng.integers(0, 2, (draws, len(groups))) - 1.0
-    # Where the model has them: as measured, fixes of a prism that stands still would be neighbours by their noise.
+    # Positions of the model, as measured positions of a prism that stands still would be neighbours by their noise.
     place_mm = projection.samples.position_mm - projection.error_mm
     range_mm = np.linalg.norm(place_mm, axis=1)[:, None]
     sight = place_mm / np.maximum(range_mm, _LEAST_MM)
-    time_s = projection.samples.average(projection.situation.extra("time_s")[:, None])
+    time_s = projection.samples.average(projection.context.extra("time_s")[:, None])
     for where, variable, at, error in (
         ("base", "time", time_s, residual),
         ("station", "range", range_mm, (residual * sight).sum(axis=1)[:, None]),
@@ -189,13 +192,13 @@ def neighbour_tests(projection: Projection, rng: np.random.Generator, draws: int
         yield NeighbourTest(
             where,
             variable,
-            float(product.sum() - _WANDERS * sizes.sum()),
+            float(product.sum() - _CORRELATED * sizes.sum()),
             ((signs @ between) * signs).sum(axis=1),
         )
 
 
 def _pairs(at: Floats, group: Integers) -> tuple[Integers, Integers]:
-    """Return pairs of every sample and its nearest neighbours, each pair once, none within a group (m,)."""
+    """Return each pair of a sample and one of its nearest neighbours once, without pairs within a group (m,)."""
     known = np.flatnonzero(np.isfinite(at).all(axis=1))
     if len(known) <= _NEAREST:
         return known[:0], known[:0]

@@ -1,13 +1,14 @@
-"""Forecasts: how visible every effect would be in these data, whether it is there or not.
+"""Forecasts: how visible every effect would be in these data, whether it exists or not.
 
-Calibration hides physics: of what an effect moves, a refit absorbs most, and another effect may imitate the rest. Both
-follow from the poses alone. With G (r, k) what one prior sigma of each coefficient moves in the projected space and
-G'G = V diag(l) V', an effect c makes the expected log Bayes factor of a candidate H with eigenvalues l and basis U
+Calibration hides effects: a refit of the kinematics absorbs most of an effect's displacements, and a different effect
+may imitate the rest. Both follow from the poses alone. Let G (r, k) be the displacements by one prior sigma of each
+coefficient in the projected space, and c the coefficients of a true effect. The expected log Bayes factor of a
+candidate H with H'H = V diag(l) V' and orthonormal basis U of its columns is
 
-    1/2 sum_i (|U_i' G c|^2 + 1) l_i / (1 + l_i) - 1/2 sum_i ln(1 + l_i),
+    1/2 sum_i (|U_i' G c|^2 + 1) l_i / (1 + l_i) - 1/2 sum_i ln(1 + l_i).
 
-so how large c must be for the effect to stand out from nothing and from every alternative is a closed form. A curve
-that is free enough to imitate anything is no alternative: its evidence pays for the freedom.
+The size of c at which the effect stands out from no effect and from every alternative therefore has a closed form. A
+curve that is flexible enough to imitate anything is not an alternative, as its evidence is penalised for this.
 """
 
 from __future__ import annotations
@@ -25,10 +26,10 @@ from calibration.gap.result import Forecast
 from calibration.gap.screening import Screen
 from calibration.observations import Floats
 
-_NAMED = 5.0  # log Bayes factor over nothing, and over any alternative
-_SURE = math.log(0.95 / 0.05)  # log odds, its share of the prior taken into account
-_FREE = 4  # coefficients; variants of another effect with more are no alternatives
-_SEEN = 1e-9  # eigenvalue of what is visible, of the largest
+_NAMED = 5.0  # log Bayes factor required against no effect and against any alternative
+_SURE = math.log(0.95 / 0.05)  # log odds required, including the prior
+_FREE = 4  # variants of other effects with more coefficients are not alternatives
+_SEEN = 1e-9  # smallest eigenvalue that counts as visible, relative to the largest
 
 
 @dataclass(frozen=True)
@@ -36,10 +37,10 @@ class _Variant:
     """One variant of a candidate, as a model to fit.
 
     Attributes:
-        candidate: index of its candidate.
-        basis: (r, k) orthonormal, of what it can move.
-        kept: (k,) l / (1 + l): share of a residual along the basis that the prior lets it take.
-        chance: expected log Bayes factor of it where there is noise alone.
+        candidate: index of the candidate.
+        basis: (r, k) orthonormal basis of the variant's columns.
+        kept: (k,) l / (1 + l): share of a residual along the basis that the variant explains under its prior.
+        chance: expected log Bayes factor for noise alone.
     """
 
     candidate: int
@@ -50,14 +51,14 @@ class _Variant:
 
 @dataclass(frozen=True)
 class _Shown:
-    """A candidate as the truth, in the variant that shows most.
+    """A candidate as the true effect, in its most visible variant.
 
     Attributes:
-        option: index of that among the candidate's.
-        leading: its first coefficient.
-        main: (r, k) what one prior sigma of each coefficient moves, without those that only shape it.
-        visible: share of it, RMS, that the kinematics cannot absorb.
-        visible_mm: RMS of that.
+        option: index of this variant in the candidate.
+        leading: the first coefficient.
+        main: (r, k) projected displacements by one prior sigma of each coefficient, without shape coefficients.
+        visible: RMS share of the displacements that the kinematics cannot absorb.
+        visible_mm: RMS of this part.
     """
 
     option: int
@@ -68,7 +69,7 @@ class _Shown:
 
 
 def forecasts(screen: Screen) -> tuple[Forecast, ...]:
-    """Return one forecast for each candidate, in the order of the screen's."""
+    """Return one forecast for each candidate of a screen, in order."""
     variants: list[_Variant] = []
     shown: list[_Shown] = []
     own: list[int] = []
@@ -94,15 +95,15 @@ def forecasts(screen: Screen) -> tuple[Forecast, ...]:
 
 
 class _Alternatives:
-    """All variants as models to fit, for many truths at once.
+    """All variants as models to fit, for many true effects at once.
 
     Args:
-        variants: v of them.
-        families: (v) of each.
+        variants: v variants.
+        families: family of each variant.
 
     Attributes:
         variants: as above.
-        chance: (v,) expected log Bayes factor of noise alone.
+        chance: (v,) expected log Bayes factors for noise alone.
     """
 
     def __init__(self, variants: list[_Variant], families: list[str]) -> None:
@@ -112,15 +113,15 @@ class _Alternatives:
         self._is_alternative = np.array([v.basis.shape[1] <= _FREE for v in variants])
 
     def against(self, family: str) -> Integers:
-        """Return indices of the variants of other families that are not free to imitate anything."""
+        """Return the indices of variants of other families that are not too flexible."""
         return np.flatnonzero(self._is_alternative & (self._family != family))
 
     def of(self, truths: list[Floats]) -> tuple[Floats, Floats]:
-        """Return how well every variant imitates each of t truths (r, k), whose coefficients share equally.
+        """Return how well every variant imitates each of t true effects (r, k) with equal coefficients.
 
         Returns:
-            (t, v) the part of a truth's squares that each variant can take, and (t, v) by how much a square of its size
-            raises the variant's expected log Bayes factor.
+            (t, v) the part of a true effect's squares that each variant can explain, and (t, v) the increase of the
+            variant's expected log Bayes factor per squared size of the true effect.
         """
         basis, kept = np.hstack([v.basis for v in self.variants]), np.concatenate([v.kept for v in self.variants])
         begin = np.cumsum([0, *(v.basis.shape[1] for v in self.variants)])[:-1]
@@ -161,14 +162,14 @@ def _forecast(
 
 
 def _least_size(own: int, others: Integers, evidence: Floats, chance: Floats, log_prior: float) -> float:
-    """Return the least size of an effect, in prior sigmas, each coefficient its share, at which it is named.
+    """Return the smallest size of an effect, in prior sigmas with equal coefficients, at which it is named.
 
     Args:
-        own: index of its variant.
-        others: indices of its alternatives' variants.
-        evidence: (v,) by what its square raises the expected log Bayes factor of each variant.
-        chance: (v,) that of noise alone.
-        log_prior: of the effect.
+        own: index of the effect's variant.
+        others: indices of the alternatives' variants.
+        evidence: (v,) increase of the expected log Bayes factor of each variant per squared size of the effect.
+        chance: (v,) expected log Bayes factors for noise alone.
+        log_prior: log prior probability of the effect.
     """
     wanted = [max(_NAMED, _SURE - log_prior) - chance[own], *(_NAMED - chance[own] + chance[others])]
     gained = [evidence[own], *(evidence[own] - evidence[others])]
@@ -179,14 +180,14 @@ def _least_size(own: int, others: Integers, evidence: Floats, chance: Floats, lo
 
 
 def _distinct(screen: Screen, candidate: int) -> list[int]:
-    """Return the variants of different columns; of those that differ in their prior alone the one with the widest."""
+    """Return the variants with distinct columns; of variants that differ only in the prior, the one with the widest."""
     sigma = [additions.prior_sigma.sum() for additions in screen.candidates[candidate].additions]
     return [max(same, key=sigma.__getitem__) for same in screen.distinct(candidate)]
 
 
 def _variant(candidate: int, columns: Floats) -> _Variant:
     value, vector = np.linalg.eigh(columns.T @ columns)
-    if not value[-1] > 0.0:  # nothing of it is left: it can take nothing
+    if not value[-1] > 0.0:  # nothing of the variant is left after projection: it explains nothing
         return _Variant(candidate, np.zeros((len(columns), 1)), np.zeros(1), 0.0)
     seen = value > _SEEN * value[-1]
     value, vector = value[seen], vector[:, seen]
@@ -195,7 +196,7 @@ def _variant(candidate: int, columns: Floats) -> _Variant:
 
 
 def _truth(screen: Screen, number: int, options: list[int]) -> _Shown:
-    """Return the variant that shows most, of those with the coefficients of the first."""
+    """Return the most visible variant among those with the same coefficients as the first."""
     candidate, projection = screen.candidates[number], screen.projection
     names = candidate.additions[options[0]].names
     best: tuple[float, int, Floats, list[int], tuple[Coefficient, ...]] | None = None
@@ -209,7 +210,7 @@ def _truth(screen: Screen, number: int, options: list[int]) -> _Shown:
         power = float((moved**2).sum())
         if best is None or power > best[0]:
             best = power, option, moved, main, coefficients
-    assert best is not None  # the first has its own names
+    assert best is not None  # the first variant always qualifies
     power, option, moved, main, coefficients = best
     additions = candidate.additions[option]
     raw_mm = projection.moved_mm(additions)[:, :, main] * additions.prior_sigma[main]
@@ -220,11 +221,11 @@ def _truth(screen: Screen, number: int, options: list[int]) -> _Shown:
 
 
 def _coefficients(screen: Screen, choice: Choice) -> tuple[Coefficient, ...]:
-    return library()[choice.family].coefficients(screen.projection.situation, choice.where, choice.settings)
+    return library()[choice.family].coefficients(screen.projection.context, choice.where, choice.settings)
 
 
 def _leading(choice: Choice, coefficients: tuple[Coefficient, ...]) -> list[int]:
-    """Return indices of the coefficients that outputs list; all where these list something else."""
+    """Return the indices of the coefficients that outputs report; all if the outputs report other numbers."""
     fitted = tuple(FittedCoefficient(c.name, c.unit, 0.0, 0.0, c.sigma) for c in coefficients)
     listed = {c.name for c in library()[choice.family].reported(choice.settings, fitted)}
     found = [i for i, c in enumerate(coefficients) if c.name in listed]

@@ -1,12 +1,13 @@
 """Residuals of a fit with the freedom of its kinematics projected out: the space in which effects are scored.
 
-A refit of the kinematics absorbs most of what an effect does, so an effect counts by what it cannot. About the fit the
-model is linear and normal, y = J x + C c + noise, x ~ N(0, P): with J P J' counted as noise and all of it whitened,
+A refit of the kinematics absorbs most of an effect's displacements, so an effect is scored by the part that it cannot
+absorb. At the fit the model is linear and normal, y = J x + C c + noise, x ~ N(0, P). With J P J' counted as noise, and
+everything whitened,
 
     Sigma^-1/2 y = Sigma^-1/2 C c + N(0, I),    Sigma = V + J P J',
 
-kinematics are projected out softly: nothing is lost along what the priors know, and an infinite prior is the orthogonal
-projection of Frisch and Waugh (Econometrica 1, 1933).
+the kinematics are projected out softly: directions that the priors determine are kept, and an infinite prior gives the
+orthogonal projection of Frisch and Waugh (Econometrica 1, 1933).
 """
 
 from __future__ import annotations
@@ -33,10 +34,10 @@ Integers = NDArray[np.intp]
 
 
 class SoftProjection:
-    """Projection of whitened rows off the kinematics as far as their prior lets these move: (I + K K')^-1/2.
+    """Soft projection of whitened rows off the kinematics, limited by their prior: (I + K K')^-1/2.
 
     Args:
-        kinematics: (r, q) K.
+        kinematics: (r, q) matrix K, whitened columns in prior sigmas.
     """
 
     def __init__(self, kinematics: Floats) -> None:
@@ -50,7 +51,7 @@ class SoftProjection:
 
     @cached_property
     def _middle(self) -> Floats:
-        # Of a triangular root of I + K'K, whose small singular values do not suffer from the large ones' squares.
+        # Computed from a triangular root of I + K'K, as squaring would lose the precision of small singular values.
         _, root, axes = np.linalg.svd(self._root.T)
         middle: Floats = axes.T / (root * (1.0 + root)) @ axes
         return middle
@@ -62,48 +63,49 @@ class SoftProjection:
 
     @property
     def degrees_of_freedom(self) -> float:
-        """Number of directions that the kinematics take out of the rows: trace of K (I + K'K)^-1 K'."""
+        """Effective number of directions that the kinematics remove from the rows: trace of K (I + K'K)^-1 K'."""
         return len(self._inverse) - float((self._inverse**2).sum())
 
     def removed(self, whitened: Floats) -> Floats:
-        """Return (q, k) the part of rows (r, k), or (q,) of (r,), along the kinematics.
+        """Return the components (q, k) of rows (r, k), or (q,) of (r,), along the kinematics.
 
-        a'b less the product of both removed parts is the product of the projected a and b.
+        a'b minus the product of the removed components of a and b is the product of the projected a and b.
         """
         return self.removed_by(self._kinematics.T @ whitened)
 
     def removed_by(self, products: Floats) -> Floats:
-        """Return `removed` (..., q, k) of rows whose products with the kinematics (..., q, k) are given."""
+        """Return `removed` (..., q, k) for rows whose products with the kinematics (..., q, k) are given."""
         removed: Floats = self._inverse @ products
         return removed
 
 
 class Projection:
-    """Linear model of m samples about a fit, with its kinematics projected out.
+    """Linear model of m samples at a fit, with its kinematics projected out.
 
     Args:
         solution: kinematics and the effects adopted so far, as fitted.
-        situation: of the n observations.
-        fit: noise and outliers are taken from it; `solution`'s own by default.
-        tried: an effect that `fit` has in addition to those adopted: it is not projected out, but the model is linear
-            about its coefficients.
+        context: context of the n observations.
+        fit: the fit that gives noise and outlier weights; `solution`'s own by default.
+        tried: an effect of `fit` in addition to the adopted ones. It is not projected out, but its fitted coefficients
+            are part of the linearisation point.
 
     Attributes:
-        samples, situation: as above.
-        groups: (m,) stretches of a path or workspace cells, a standstill in one of them; no fold separates them.
-        joint_jacobian: (m, 3, joints) by reading, station's frame, mm per deg or mm.
-        jacobian: (m, 3, p) by the chain's parameters, mm per mm or rad.
-        error_mm: (m, 3) measured minus fitted positions, outliers included, station's frame.
-        target: (3 m,) whitened positions that kinematics and effects have to explain.
+        samples, context: as above.
+        groups: (m,) labels of groups that folds do not split: stretches of a path, or workspace cells; a standstill is
+            always in one group.
+        joint_jacobian: (m, 3, joints) derivatives by reading, station's frame, mm per deg or mm.
+        jacobian: (m, 3, p) derivatives by the chain's parameters, mm per mm or rad.
+        error_mm: (m, 3) measured minus fitted positions, including outliers, station's frame.
+        target: (3 m,) whitened positions to be explained by kinematics and effects.
         kinematics: (3 m, q) whitened displacement by one prior sigma of each parameter and adopted coefficient.
         without_kinematics: the soft projection off `kinematics`.
     """
 
     def __init__(
-        self, solution: Solution, situation: EffectContext, fit: Fit | None = None, tried: EffectColumns | None = None
+        self, solution: Solution, context: EffectContext, fit: Fit | None = None, tried: EffectColumns | None = None
     ) -> None:
         self.samples: Samples = solution.samples
-        self.situation = situation
+        self.context = context
         fit = solution.fit if fit is None else fit
         parts = [part for part in (solution.additions, tried) if part is not None]
         additions = joined(parts, len(self.samples)) if parts else None
@@ -121,7 +123,7 @@ class Projection:
 
     @cached_property
     def residual(self) -> Floats:
-        """(3 m,) projected target; independent standard normal numbers if nothing is missing."""
+        """(3 m,) projected target; independent standard normal if nothing is missing."""
         return self.without_kinematics(self.target)
 
     def whitened(self, moved_mm: Floats) -> Floats:
@@ -132,17 +134,17 @@ class Projection:
     def whitened_by_reading(self, joint: int) -> csr_array:
         """Return (3 m, m) the whitened displacements by one unit of a joint's reading in each of the samples.
 
-        A sample's displacement is seen in the rows of its own standstill alone: its fixes share noise.
+        A sample's displacement is nonzero only in the rows of its own standstill, whose fixes have correlated noise.
 
         Args:
-            joint: its index in the chain.
+            joint: index of the joint in the chain.
         """
         standstill = np.unique(self.samples.standstill, return_inverse=True)[1]
         order = np.argsort(standstill, kind="stable")
         first = np.searchsorted(standstill[order], standstill)
         place = np.empty_like(order)
         place[order] = np.arange(len(order))
-        place -= first  # of each sample among those of its standstill
+        place -= first  # index of each sample within its standstill
         width = int(place.max()) + 1
         at = self.joint_jacobian[:, :, joint, None] * (place[:, None, None] == np.arange(width))
         sample = order[np.minimum(first[:, None] + np.arange(width), len(order) - 1)]
@@ -157,7 +159,7 @@ class Projection:
         return self.without_kinematics(self._whiten(moved_mm))
 
     def held_out_mm(self, fold: Integers) -> Floats:
-        """Return (m, 3) errors of every sample by the linear model fitted without its fold (m,)."""
+        """Return errors (m, 3) of every sample in the linear model fitted without its fold (m,), mm."""
         found = self._found
         moved = [found.parameter_jacobian]
         if self._additions is not None:
@@ -172,13 +174,13 @@ class Projection:
     def solved(self, more: EffectColumns) -> Floats:
         """Solve the linear model with further coefficients.
 
-        It counts every fix as the projection does; a fit from another start may never come to that.
+        The solution uses the weights of the projection, which a nonlinear fit from a different start may not reach.
 
         Args:
-            more: the further coefficients, for the samples.
+            more: columns of the further coefficients, for the samples.
 
         Returns:
-            (q + k,) parameters, adopted coefficients and further ones.
+            (q + k,) parameters, adopted coefficients and further coefficients.
         """
         sigma = more.prior_sigma
         design = np.hstack([self.kinematics, self.whitened(self.moved_mm(more)) * sigma])
@@ -189,19 +191,20 @@ class Projection:
         return solved
 
     def moved_mm(self, additions: EffectColumns) -> Floats:
-        """Return (m, 3, k) the displacements by unit coefficients of the samples' additions."""
+        """Return displacements (m, 3, k) by unit coefficients of `additions`, mm."""
         return additions.moved_mm(self.joint_jacobian)
 
 
 def follows_path(samples: Samples) -> bool:
-    """True if the poses follow one path, and are not taken one independently of the other."""
+    """Return True if the poses follow one path, rather than being independent of each other."""
     return path_stretches(samples.data.readings, samples.data.setup) is not None
 
 
 def cells(samples: Samples) -> Labels:
-    """Return (m,) labels for grouped splits: stretches of a path, else workspace cells; a standstill is in one of them.
+    """Return labels (m,) for grouped splits: stretches of a path, or workspace cells; standstills are not split.
 
-    Set-ups and sessions are no groups here: without a set-up's fixes its base, a part of the fit, is undetermined.
+    Set-ups and sessions are not used as groups, as a set-up's base, a part of the fit, is undetermined without its
+    fixes.
     """
     setup = samples.data.setup
     first = np.arange(len(samples)) if samples.standstill is None else samples.standstill
@@ -213,12 +216,12 @@ def cells(samples: Samples) -> Labels:
 
 
 def without_folds(design: Floats, target: Floats, fold: Integers) -> Iterator[tuple[int, Floats]]:
-    """Yield every fold with the solution of the linear model without it.
+    """Yield the number of every fold with the solution of the linear model without it.
 
     Args:
         design: (3 m, q) whitened columns, in prior sigmas.
-        target: (3 m,).
-        fold: (m,) of each sample.
+        target: (3 m,) whitened target.
+        fold: (m,) fold number of each sample.
     """
     whole, right = design.T @ design, design.T @ target
     for number in np.unique(fold):
@@ -245,6 +248,6 @@ def from_products(gram: Floats, along: Floats, sigma: Floats) -> float:
 
 
 def rows_of(samples: Sequence[int] | Integers) -> Integers:
-    """Return (3 s,) the rows of the given samples."""
+    """Return the row indices (3 s,) of the given samples."""
     index: Integers = (3 * np.asarray(samples, dtype=np.intp)[:, None] + np.arange(3)).ravel()
     return index

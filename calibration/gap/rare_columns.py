@@ -1,4 +1,4 @@
-"""Columns of curves, most of whose values are zero: of all candidates these are most of the memory."""
+"""Sparse storage for columns of curves, which are mostly zero and would take most of the memory of all candidates."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from scipy.sparse import csr_array
 from calibration.effects.columns import EffectColumns, Integers
 from calibration.observations import Floats
 
-_RARE = 0.25  # share of values that are not zero, at most
+_RARE = 0.25  # largest share of nonzero values for sparse storage
 
 
 class RareColumns(EffectColumns):
-    """Coefficients at a joint whose columns are in memory without their zeros.
+    """Coefficients at a joint with sparse columns.
 
     Args:
-        names, joint, prior_sigma: as of `EffectColumns`.
-        column: the same, dense or sparse.
+        names, joint, prior_sigma: as for `EffectColumns`.
+        column: as for `EffectColumns`, dense or sparse.
         shift_mm: None.
 
     Attributes:
@@ -37,7 +37,7 @@ class RareColumns(EffectColumns):
 
     @property
     def column(self) -> Floats:
-        """(m, k) deg or mm, made anew each time."""
+        """(m, k) dense columns, deg or mm; computed on each access."""
         dense: Floats = self.sparse.toarray()
         return dense
 
@@ -62,7 +62,7 @@ class RareColumns(EffectColumns):
 
 
 def without_zeros(columns: EffectColumns) -> EffectColumns:
-    """Return the same coefficients, without the zeros of their columns where these are most and one joint moves."""
+    """Return the same coefficients with sparse columns, if all are at one joint and most values are zero."""
     is_at_joint = columns.shift_mm is None and len(set(columns.joint.tolist())) == 1
     if not is_at_joint or np.count_nonzero(columns.column) > _RARE * columns.column.size:
         return columns

@@ -1,7 +1,7 @@
-"""Regimes: effects that act in a part of the data only, found by the evidence of every effect in every part.
+"""Regimes: effects that act in only a part of the data, found by the evidence of every effect in every part.
 
-The part is the rows in which a variable is above a border, or all others. Products of columns are summed over slices of
-the variable, so that all borders of it cost little more than one.
+A part is the rows in which a variable is above a border, or the other rows. Products of columns are summed over slices
+of the variable, so that many borders cost little more than one.
 """
 
 from __future__ import annotations
@@ -26,23 +26,23 @@ from calibration.gap.screening import Screen
 from calibration.numerics.matrices import gram
 from calibration.observations import Floats
 
-_BORDERS = 6  # of a variable, at first
-_SCREENED = 500  # samples that choose which effects are fitted
-_LEAST = 0.05  # share of the samples on either side of a border
-_MOST_FORMS = 40  # of a candidate: one with more is a step at any time
-_FITTED = 8  # effects that are fitted at a time
-_FIRST = 3  # of them, before one that must be the last is given up
+_BORDERS = 6  # borders of a variable in the screening
+_SCREENED = 500  # samples used in the screening
+_LEAST = 0.05  # smallest share of the samples on either side of a border
+_MOST_FORMS = 40  # largest number of variants of a candidate; step effects have more
+_FITTED = 8  # effects that are fitted per round
+_FIRST = 3  # fits after which the search for a last effect may be abandoned
 _ROUNDS = 2
-_PASSES = 3  # of a border and the fit that it depends on
-_ON_THE_WAY = 0.5  # of what an effect has to gain: the best of the first round have more
-_OUTLIER = 6.0  # median errors: more is no worse
+_PASSES = 3  # iterations between border and fit
+_LEAST_PROGRESS = 0.5  # share of the required gain that the best fit of a round must reach to continue
+_OUTLIER = 6.0  # larger errors, in medians, are clipped to this value
 _HALF = 0.5
-_AT_ONCE = 1_000_000  # values of products: more than the caches hold costs time, and gigabytes where there are many
-_WIDE = 50  # columns of curves, most of whose values are zero
-_REGIME = math.log(0.1)  # prior probability that an effect acts in a part only
-_LIKELY = 3.0  # factor on plausible sizes: only an effect that is large shows in a part
-_BETTER = math.log(999.0)  # log odds against nothing
-_POSTERIOR = 0.95  # of an effect among all that are fitted, and of its variable among all
+_AT_ONCE = 1_000_000  # values of products per batch, to fit into the processor's caches and to save memory
+_WIDE = 50  # blocks with this many columns are of curves, with mostly zero values
+_REGIME = math.log(0.1)  # log prior probability that an effect acts only in a part
+_LIKELY = 3.0  # factor on plausible sizes, as only a large effect is visible in a part
+_BETTER = math.log(999.0)  # log odds required against no effect
+_POSTERIOR = 0.95  # required of an effect among all fitted ones, and of its variable among all variables
 
 
 @dataclass(frozen=True)
@@ -50,8 +50,8 @@ class EffectInRegime:
     """An effect that acts in a part of the data.
 
     Attributes:
-        joint: the fit with it, as its last effect.
-        posterior: probability of the effect in this part among all effects and parts.
+        joint: the fit, with this effect as its last.
+        posterior: posterior probability among all effects and parts.
     """
 
     joint: JointFit
@@ -72,18 +72,18 @@ def effect_in_regime(
     *,
     is_last: bool = False,
 ) -> EffectInRegime | None:
-    """Return the effect of greatest evidence in a part of the data, where that is beyond doubt.
+    """Return the effect of greatest evidence in a part of the data, if it is certain.
 
     Args:
         problem: the data.
-        joint: kinematics and effects that are there, with the weights that count; one of the same name gives way.
-        families: of effects that may be there.
-        like: candidates about another fit, most of whose columns are the same.
-        most_cost: a fit of greater cost is of no use, nats.
-        is_last: nor is one that leaves more than noise.
+        joint: kinematics and present effects, with the weights to use; a present effect of the same name is replaced.
+        families: families of effects to try.
+        like: candidates of an earlier fit, most of whose columns can be reused.
+        most_cost: largest useful cost of a fit, nats.
+        is_last: True if only a fit that leaves nothing but noise is useful.
 
     Returns:
-        The effect; None where nothing is certain, or of use.
+        The effect; None if no effect is certain and useful.
     """
     needed = joint.fit.cost - most_cost
     fitted: dict[str, _Fitted] = {}
@@ -98,12 +98,12 @@ def effect_in_regime(
         if not fitted:
             return None
         best = min(fitted.values(), key=lambda own: own.joint.fit.cost)
-        if joint.fit.cost - best.joint.fit.cost < _ON_THE_WAY * needed:
+        if joint.fit.cost - best.joint.fit.cost < _LEAST_PROGRESS * needed:
             return None
-        # What is near in the noise that kinematics leave may be far apart in the noise that the true effect leaves.
+        # Effects that are similar at the noise of the kinematics may differ clearly at the noise of the true effect.
         about = problem.project(best.joint, without_last=True)
-    cost = [own.joint.fit.cost for own in fitted.values() if not own.joint.beyond(len(own.joint.choices) - 1)]
-    if best.joint.fit.cost not in cost:  # beyond what is physical
+    cost = [own.joint.fit.cost for own in fitted.values() if not own.joint.beyond_limits(len(own.joint.choices) - 1)]
+    if best.joint.fit.cost not in cost:  # beyond its hard limits
         return None
     posterior = 1.0 / sum(math.exp(best.joint.fit.cost - own) for own in cost)
     is_certain = min(posterior, best.posterior) > _POSTERIOR
@@ -116,7 +116,7 @@ class _Fitted:
 
     Attributes:
         joint: the fit.
-        posterior: probability of the part's variable and side, given the effect.
+        posterior: posterior probability of the part's variable and side, given the effect.
     """
 
     joint: JointFit
@@ -124,15 +124,16 @@ class _Fitted:
 
 
 def _leaves_much(problem: Problem, fitted: Collection[_Fitted]) -> bool:
-    """True if the best of some fits leaves so much that none of less promise can leave noise."""
+    """Return True if the best fit leaves so much structure that no less promising one can leave only noise."""
     best = min(fitted, key=lambda own: own.joint.fit.cost)
     return detect(Grammar(problem.project(best.joint)), problem.rng()).p < FAR
 
 
 def _fitted(problem: Problem, joint: JointFit, choice: Choice) -> _Fitted:
-    """Return the fit of a further effect in the part of the data in which the errors are least, by any variable.
+    """Return the fit of a further effect in the part of the data, by any variable, that minimises the errors.
 
-    A row on the wrong side of a border looks like an outlier, which has no say in a fit.
+    The border is optimised with clipped errors of all rows, as a row on the wrong side of it looks like an outlier and
+    has no weight in the fit.
     """
     others = [c for c in joint.choices if str(c) != str(choice)]
     found = problem.fit([*others, choice], joint.start(others))
@@ -146,18 +147,18 @@ def _fitted(problem: Problem, joint: JointFit, choice: Choice) -> _Fitted:
 
 
 def _best_form(problem: Problem, joint: JointFit, part: Regime) -> Choice:
-    """Return the last effect of a fit in its best form in a part of the data."""
+    """Return the last effect of a fit in its best variant in a part of the data."""
     last, projection = joint.choices[-1], problem.project(joint, without_last=True)
-    forms = [replace(form, regime=part) for form in variants_at(joint.situation, last.family, last.where)]
-    own = candidate_at(joint.situation, projection, last.family, last.where, forms)
+    forms = [replace(form, regime=part) for form in variants_at(joint.context, last.family, last.where)]
+    own = candidate_at(joint.context, projection, last.family, last.where, forms)
     return Screen(projection, [own]).score()[0].choice
 
 
 def _best_part(problem: Problem, joint: JointFit) -> tuple[Regime, float]:
-    """Return where a fit's last effect leaves the least errors, and the probability of that variable and side."""
+    """Return the part in which a fit's last effect gives the smallest errors, and the probability of its variable."""
     choice, own = joint.choices[-1], joint.slice_of(len(joint.choices) - 1)
     assert choice.regime is not None
-    samples, context = problem.solution.samples, joint.situation
+    samples, context = problem.solution.samples, joint.context
     whole = replace(choice, regime=None).columns(context).over(samples.average)
     moved = problem.project(joint).moved_mm(whole) @ joint.fit.x[own]
     inside = samples.average(choice.regime.holds(context).astype(np.float64)[:, None]) > _HALF
@@ -174,7 +175,7 @@ def _best_part(problem: Problem, joint: JointFit) -> tuple[Regime, float]:
         count = np.searchsorted(values[order], border)
         gain = np.concatenate([[0.0], np.cumsum((outside - within)[order])])
         for above, cost in ((True, gain[count]), (False, -gain[count])):
-            # Those up to a border are outside of a part above it.
+            # Samples up to a border are outside a part above it.
             total = cost + (within if above else outside).sum()
             best = int(total.argmin())
             found.append((float(total[best]), Regime(variable, above, float(border[best]))))
@@ -185,12 +186,12 @@ def _best_part(problem: Problem, joint: JointFit) -> tuple[Regime, float]:
 def _screened(
     projection: Projection, families: Collection[str], like: Sequence[CandidateEffect] = ()
 ) -> list[tuple[Choice, float]]:
-    """Return every candidate in its best part about a fit with its log odds, the most probable first.
+    """Return every candidate in its best part with its log odds, the most probable first.
 
-    The odds are against nothing and averaged over forms, sides and borders.
+    The odds are against no effect and averaged over variants, sides and borders.
     """
-    every = each_candidate(projection.situation, projection, families, like)
-    values = {name: projection.samples.average(v[:, None])[:, 0] for name, v in variables(projection.situation).items()}
+    every = each_candidate(projection.context, projection, families, like)
+    values = {name: projection.samples.average(v[:, None])[:, 0] for name, v in variables(projection.context).items()}
     log_prior = _REGIME - math.log(2.0 * max(len(values), 1))
     some = np.unique(np.linspace(0, len(projection.samples) - 1, _SCREENED).astype(np.intp))
     columns = _Columns(projection, (c for c in every if len(set(c.first_equal)) <= _MOST_FORMS), some)
@@ -212,7 +213,12 @@ def _screened(
 
 
 def borders(values: Floats, count: int) -> Floats:
-    """Return at most so many borders between values (m,), halfway between neighbours and evenly in their order."""
+    """Return borders between values, midway between neighbours and evenly spaced in rank.
+
+    Args:
+        values: (m,) values, NaN where not known.
+        count: largest number of borders.
+    """
     known = np.sort(values[np.isfinite(values)])
     at = np.unique((np.linspace(_LEAST, 1.0 - _LEAST, count) * len(known)).astype(int))
     distinct = np.unique(known)
@@ -224,7 +230,7 @@ def borders(values: Floats, count: int) -> Floats:
 
 
 class _Use(NamedTuple):
-    """A candidate in a form that has a block of columns, and their prior sigmas (k,)."""
+    """A variant of a candidate that uses a block of columns, and the prior sigmas (k,) of the columns."""
 
     candidate: int
     option: int
@@ -235,9 +241,9 @@ class _Columns:
     """Whitened columns of candidates, and their evidence in parts of some samples of a projection.
 
     Args:
-        projection: about a fit.
-        candidates: effects; the columns of one are over all samples only while it is read.
-        some: (s,) index of the samples.
+        projection: projection at a fit.
+        candidates: the effects, read one at a time so that columns for all samples are held for only one of them.
+        some: (s,) indices of the samples to use.
 
     Attributes:
         candidates: the effects, without columns.
@@ -249,7 +255,7 @@ class _Columns:
         self._without = SoftProjection(self._kinematics)
         self._removed_target = self._without.removed(self._target)
         self.candidates: list[CandidateEffect] = []
-        self._of: dict[int, list[list[_Use]]] = {}  # number of columns -> forms that have each block
+        self._of: dict[int, list[list[_Use]]] = {}  # number of columns -> variants that use each block
         self._by_reading: dict[int, csr_array] = {}
         own_rows: dict[int, list[Floats]] = {}
         for number, candidate in enumerate(candidates):
@@ -265,7 +271,7 @@ class _Columns:
         self._rows = {width: np.hstack(own_rows.pop(width)) for width in self._of}
 
     def _whitened(self, projection: Projection, additions: EffectColumns, rows: Integers) -> Floats:
-        """Return some of the whitened rows (r,) of an effect; of one that acts through its joint alone, only these."""
+        """Return the whitened columns of an effect in `rows` (r,), without computing other rows where possible."""
         joints = set(additions.joint.tolist())
         if additions.shift_mm is not None or len(joints) != 1:
             whole = projection.whitened(projection.moved_mm(additions))
@@ -276,14 +282,14 @@ class _Columns:
         return np.asarray(self._by_reading[joint] @ additions.column)
 
     def evidence(self, borders: int, slice_of: Integers) -> list[Floats]:
-        """Return for each candidate (options, borders, 2) log evidence with the prior odds of its forms.
+        """Return the log evidence of each candidate in parts, including the prior odds of its variants.
 
         Args:
-            borders: number of borders, of which samples of slice i are above the first i.
-            slice_of: (s,) of each sample.
+            borders: number of borders; samples of slice i are above the first i borders.
+            slice_of: (s,) slice of each sample.
 
         Returns:
-            For the samples that are not above a border, and for those that are.
+            For each candidate (options, borders, 2): the part at or below each border, and the part above it.
         """
         index = [rows_of(np.flatnonzero(slice_of == number)) for number in range(borders + 1)]
         found: list[dict[int, Floats]] = [{} for _ in self.candidates]
@@ -297,12 +303,12 @@ class _Columns:
         return [np.array([own[option] for option in range(len(own))]) for own in found]
 
     def _products(self, columns: Floats, width: int, index: Sequence[Integers]) -> tuple[Floats, Floats]:
-        """Return products (o, b, 2, k, k) of blocks of projected columns, and with the target (o, b, 2, k).
+        """Return products (o, b, 2, k, k) of blocks of projected columns, and products with the target (o, b, 2, k).
 
         Args:
-            columns: (3 m, o k) of o blocks.
-            width: k.
-            index: rows of each of b + 1 slices.
+            columns: (3 m, o k) columns of o blocks.
+            width: number of columns k of each block.
+            index: row indices of each of the b + 1 slices.
         """
         with_kinematics, with_target, grams = [], [], []
         for rows in index:
@@ -320,7 +326,7 @@ class _Columns:
 
 
 def _each_use(uses: Sequence[Sequence[_Use]], products: Floats, along: Floats) -> Iterator[tuple[int, int, Floats]]:
-    """Yield candidate, option and log Bayes factors (b, 2) of all forms that have each of o blocks of columns."""
+    """Yield candidate, option and log Bayes factors (b, 2) of all variants that use any of o blocks of columns."""
     for turn in range(max(map(len, uses))):
         block = [number for number, own in enumerate(uses) if len(own) > turn]
         sigma = np.array([uses[number][turn].sigma for number in block])
@@ -330,15 +336,15 @@ def _each_use(uses: Sequence[Sequence[_Use]], products: Floats, along: Floats) -
 
 
 def _on_both_sides(slices: Sequence[Floats]) -> Floats:
-    """Return (b, 2, ...) sums below and above each of b borders, from those of the b + 1 slices between them."""
+    """Return sums (b, 2, ...) below and above each of b borders, from the sums of the b + 1 slices between them."""
     below = np.cumsum(slices, axis=0)
     return np.stack([below[:-1], below[-1] - below[:-1]], axis=1)
 
 
 def _log_bayes_factors(products: Floats, along: Floats, sigma: Floats) -> Floats:
-    """Return (...) log Bayes factors, as `from_products`, of (..., k, k), (..., k) and (..., k)."""
+    """Return log Bayes factors (...), as `from_products`, for arguments (..., k, k), (..., k) and (..., k)."""
     count, right = products.shape[-1], along * sigma
-    # The last row of the bordered matrix's factor solves the system; its corner only keeps it positive definite.
+    # The last row of the bordered matrix's factor solves the system; the corner only makes it positive definite.
     bordered = np.empty((*products.shape[:-2], count + 1, count + 1))
     bordered[..., :count, :count] = products * sigma[..., None] * sigma[..., None, :] + np.eye(count)
     bordered[..., count, :count] = bordered[..., :count, count] = right

@@ -1,4 +1,4 @@
-"""The answer of `find_gap`, as reports, the command line and the daemon take it."""
+"""The result of `find_gap`, for reports, the command line and the daemon."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ class Candidate:
     """One effect at one place, scored against the others of its round.
 
     Attributes:
-        family, where: which.
-        posterior: probability that it is the one, among all of the library and nothing.
-        log_bayes_factor: of it against nothing, natural logarithm.
-        coefficients: as the linearised fit has them.
+        family, where: family and place of the effect.
+        posterior: posterior probability among all effects of the library and no effect.
+        log_bayes_factor: natural logarithm of the Bayes factor against no effect.
+        coefficients: coefficients of the linearised fit.
         bounds: name of a coefficient -> its hard limits.
-        reason: why it was not named, a clause; empty where it was.
+        reason: clause that explains why it was not named; empty if it was named.
     """
 
     family: str
@@ -47,7 +47,7 @@ class Disagreement:
 
     Attributes:
         where: joint, prism, `boom`, `base`, `station`, `clock`.
-        variable: on what the disagreement depends there: `direction`, `torque`, `sin 2 theta4`, `time` ...
+        variable: the variable on which the disagreement depends: `direction`, `torque`, `sin 2 theta4`, `time` ...
         p: p-value, corrected for all tests.
     """
 
@@ -62,13 +62,14 @@ class Disagreement:
 
 @dataclass(frozen=True)
 class Evidence:
-    """The evidence of an effect that is named, given all others.
+    """The evidence of a named effect, given all others.
 
     Attributes:
-        log_bayes_factor: against the model without it.
-        posterior: probability of its family.
-        places: place -> probability that it is there, given the family; those that the data do not exclude.
-        certificate_p: p-value on data that had no part in choosing it; NaN for a map, which no half could choose.
+        log_bayes_factor: log Bayes factor against the model without the effect.
+        posterior: posterior probability of the family.
+        places: place that the data do not exclude -> its posterior probability, given the family.
+        certificate_p: p-value on data that were not used to select the effect; NaN for a joint error map, which has no
+            such test.
     """
 
     log_bayes_factor: float
@@ -88,13 +89,13 @@ class Evidence:
 
 @dataclass(frozen=True)
 class Break:
-    """An instant after which the machine is another.
+    """An instant after which the machine is different.
 
     Attributes:
         variable: `time_s`, or `row` where the data have no time.
-        border: the last instant or row of the machine as it was is at or below it.
-        before, after: number of samples.
-        log_bayes_factor: of two machines against one, the instant chosen among all.
+        border: value of the variable; rows at or below it belong to the machine before the break.
+        before, after: number of samples before and after the break.
+        log_bayes_factor: log Bayes factor of two machines against one, including the choice of the instant.
     """
 
     variable: str
@@ -115,13 +116,13 @@ class Break:
 
     @property
     def text(self) -> str:
-        """A sentence: when, and what to do."""
+        """Sentence that states when the break was, and what to do."""
         when = f"row {math.floor(self.border)} (from 0)" if self.variable == ROW else f"time_s = {self.border:.6g}"
         fewer = "before" if self.before < self.after else "after"
         return (
-            f"after {when} the machine is another than before ({self.before} samples before, {self.after} after): give "
-            f"the rows {fewer} it a name of their own in the column setup if the station or the base moved, or leave "
-            f"them out if the machine was repaired"
+            f"after {when} the machine differs from before ({self.before} samples before, {self.after} after): give "
+            f"the rows {fewer} it a separate name in the column setup if the station or the base moved, or leave them "
+            f"out if the machine was repaired"
         )
 
 
@@ -131,10 +132,10 @@ class Experiment:
 
     Attributes:
         kind: `poses`, `approach`, `dwell`, `payload`, `prism`, `control_points`, `motion` ...
-        text: what to do, a sentence.
-        poses: a plan's rows as `rigcal plan` prints them, where it is poses.
-        stands_out_sigma: `family@where` of what the poses are to tell apart -> by how many sigma it is expected to
-            stand out from the others in them, if it is there.
+        text: sentence with instructions.
+        poses: rows of a plan as printed by `rigcal plan`, if `kind` is `poses`.
+        stands_out_sigma: `family@where` of each effect that the poses are to distinguish -> number of sigma by which it
+            is expected to stand out from the others, if it exists.
     """
 
     kind: str
@@ -143,11 +144,11 @@ class Experiment:
     stands_out_sigma: Mapping[str, float] = field(default_factory=dict)
 
     def as_dict(self) -> dict[str, object]:
-        """Return the JSON object (docs/reference/formats.md, gap), with poses and their promise, if any."""
-        told: dict[str, object] = {"kind": self.kind, "text": self.text}
+        """Return the JSON object (docs/reference/formats.md, gap), with poses and expected sigmas, if any."""
+        members: dict[str, object] = {"kind": self.kind, "text": self.text}
         if self.poses:
-            told |= {"poses": list(self.poses), "stands_out_sigma": dict(self.stands_out_sigma)}
-        return told
+            members |= {"poses": list(self.poses), "stands_out_sigma": dict(self.stands_out_sigma)}
+        return members
 
 
 @dataclass(frozen=True)
@@ -155,13 +156,13 @@ class Forecast:
     """The visibility of one effect in these data.
 
     Attributes:
-        family, where: which.
-        unit: of its first coefficient.
-        visible: share of what it moves, RMS, that refitted kinematics cannot absorb.
-        visible_mm: RMS of that at the plausible size.
-        nameable: smallest value of the first coefficient that this data could name; infinity for none within bounds.
-        alternative: `family@where` of the effect most like it; empty for none.
-        separation: share of what is visible that the alternative cannot imitate either.
+        family, where: family and place of the effect.
+        unit: unit of the first coefficient.
+        visible: RMS share of the displacements that refitted kinematics cannot absorb.
+        visible_mm: RMS of this part at the plausible size.
+        nameable: smallest value of the first coefficient that could be named from the data; infinity if beyond limits.
+        alternative: `family@where` of the most similar effect; empty for none.
+        separation: share of the visible part that the alternative cannot imitate.
     """
 
     family: str
@@ -179,9 +180,9 @@ class Round:
     """One step of the search.
 
     Attributes:
-        held_out_mm: RMS of held-out groups before anything of this round was adopted.
-        adopted: `family@where` of the effects that this round adopted; none in the last.
-        candidates: scored in this round, the most probable first.
+        held_out_mm: RMS error of held-out groups before the effects of this round were adopted.
+        adopted: `family@where` of the effects adopted in this round; empty in the last round.
+        candidates: candidates scored in this round, the most probable first.
     """
 
     held_out_mm: float
@@ -191,29 +192,29 @@ class Round:
 
 @dataclass(frozen=True)
 class GapResult:
-    """Answer of the gap workflow: a verdict, the effects it names, their evidence, and what to measure next.
+    """Result of the gap workflow: a verdict, the named effects, their evidence, and what to measure next.
 
     Attributes:
         verdict: `named`, `none`, `indistinguishable` or `unidentified`.
-        effects: all that were adopted, with their coefficients from the joint refit.
-        posterior: `family@where` of each adopted one -> probability of its family, when it was adopted.
-        evidence: `family@where` of each adopted one -> its evidence given all others, and where else it may be.
-        indistinguishable: the set that is pending, at most three families.
-        description: on what the structure depends that no effect of the library explains.
-        remaining_significant, remaining_mm: whether structure is left over, and the RMS of what is.
-        disabled: family -> what this data lacks for it.
-        before_mm, after_mm: RMS over the rows of calibrated kinematics, and with the effects.
-        noise_mm: the noise floor; `noise_source` says where it is from, a clause.
-        held_out: RMS before and after on held-out rows, mm; None where none were given.
-        disagreements: most significant first.
-        experiments: what would tell more.
-        rounds: steps of the search, in their order.
-        forecasts: of every effect that this data has the columns for.
-        model: kinematics and adopted effects, no residual.
-        observations, error_before_mm, error_after_mm: the rows with (n, 3) errors, station's frame.
+        effects: the adopted effects, with coefficients from the joint refit.
+        posterior: `family@where` of each adopted effect -> posterior of its family when it was adopted.
+        evidence: `family@where` of each adopted effect -> its evidence given all others, and other possible places.
+        indistinguishable: the set of effects that cannot be distinguished, of at most three families.
+        description: clause about the structure that no effect of the library explains; None for none.
+        remaining_significant, remaining_mm: whether structure remains, and the RMS of the remaining errors.
+        disabled: family -> reason for its exclusion.
+        before_mm, after_mm: RMS errors of the rows with calibrated kinematics only, and with the effects.
+        noise_mm: the noise floor; `noise_source` is a clause with its origin.
+        held_out: RMS errors of held-out rows before and after, mm; None without held-out rows.
+        disagreements: disagreements, most significant first.
+        experiments: proposals for what to measure next.
+        rounds: steps of the search, in order.
+        forecasts: forecasts of all effects for which the data have the columns.
+        model: kinematics and adopted effects, without a residual.
+        observations, error_before_mm, error_after_mm: the rows, and their errors (n, 3) in the station's frame.
         warnings: sentences.
-        machine_break: an instant after which the machine is another; None for none.
-        shared: how many of the held-out rows are rows that were fitted.
+        machine_break: an instant after which the machine is different; None for none.
+        shared: number of held-out rows that are also in the fitted rows.
     """
 
     verdict: Verdict

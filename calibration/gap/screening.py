@@ -1,8 +1,8 @@
 """Screening: every effect of the library at every place, scored by its evidence in the data.
 
-An effect's evidence is a closed form in the projected space (`projection`), averaged over its variants. Candidates are
-scored one at a time, and the best in pairs: of two effects that are there, a third that looks like their sum may beat
-each alone.
+An effect's evidence has a closed form in the projected space (`projection`), averaged over its variants. Candidates are
+scored one at a time, and the best ones in pairs, because if two effects exist, a third one that resembles their sum may
+beat each of them alone.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ from calibration.gap.projection import Projection, from_products
 from calibration.observations import Floats
 
 _PAIRED = 10
-_SECOND = math.log(0.05)  # prior probability that a second effect is there
-_SEEN = 1e-10  # least eigenvalue of products of columns, of their largest
+_SECOND = math.log(0.05)  # log prior probability of a second effect
+_SEEN = 1e-10  # smallest eigenvalue of products of columns that counts, relative to the largest
 _ROUNDING = 1e-12
 _TINY = float(np.finfo(np.float64).tiny)
-_EQUAL = 5.0  # log Bayes factor; less is no difference
-SCALES = (1 / 3, 1.0, 3.0, 10.0)  # of plausible sizes, which are not known better than that
+_EQUAL = 5.0  # difference of log Bayes factors below which variants explain the data equally well
+SCALES = (1 / 3, 1.0, 3.0, 10.0)  # factors on plausible sizes, which are known only roughly
 _SQUARED_SCALES = np.square(SCALES)[:, None]
 LOG_SCALE_ODDS = dict(zip(SCALES, np.log([0.2, 0.5, 0.25, 0.05]).tolist(), strict=True))
 
@@ -44,17 +44,17 @@ class ScoredEffect:
 
     Attributes:
         candidate: the effect at its place.
-        option: index of its best variant.
-        scale: of that variant's plausible sizes.
-        estimate, standard_error: (k,) of its coefficients in the linear model.
-        log_bayes_factor: against no effect, averaged over its variants.
-        form_averaging: that less the log Bayes factor of its best variant alone, the cost of not knowing the form.
+        option: index of the best variant.
+        scale: factor on the plausible sizes of this variant.
+        estimate, standard_error: (k,) estimates and standard errors of its coefficients in the linear model.
+        log_bayes_factor: log Bayes factor against no effect, averaged over variants.
+        form_averaging: `log_bayes_factor` minus that of the best variant alone: the penalty for the unknown variant.
         log_likelihood: log likelihood ratio against no effect at the best coefficients, averaged over variants.
-        p: p-value of the squares that the best variant explains, corrected for its variants.
-        posterior: probability of the candidate among all candidates, pairs and no effect.
+        p: p-value of the squares that the best variant explains, corrected for the number of variants.
+        posterior: posterior probability of the candidate among all candidates, pairs and no effect.
         log_evidence: log posterior odds against no effect of the most probable model with this candidate.
-        partner: the other effect of the pair, where that model is a pair.
-        same_family: other forms and places of its family that the data do not tell from it.
+        partner: the other effect, if that model is a pair.
+        same_family: other variants and places of the family that the data cannot distinguish from it.
     """
 
     candidate: CandidateEffect
@@ -73,26 +73,26 @@ class ScoredEffect:
 
     @property
     def choice(self) -> Choice:
-        """The best variant, at the scale that the data ask for."""
+        """The best variant, at its best scale."""
         return replace(self.candidate.options[self.option], scale=self.scale)
 
-    def fitted(self, situation: EffectContext) -> FittedEffect:
+    def fitted(self, context: EffectContext) -> FittedEffect:
         """Return the effect with the coefficients of the linear model."""
-        return self.choice.fitted(situation, self.estimate, self.standard_error)
+        return self.choice.fitted(context, self.estimate, self.standard_error)
 
     @property
     def additions(self) -> EffectColumns:
-        """Displacements of the samples by the best variant."""
+        """Columns of the best variant for the samples."""
         return self.candidate.additions[self.option]
 
     @property
     def scaled_additions(self) -> EffectColumns:
-        """`additions` with prior sigmas at the scale that the data ask for."""
+        """`additions` with prior sigmas at the best scale."""
         return replace(self.additions, prior_sigma=self.additions.prior_sigma * self.scale)
 
     @property
     def size(self) -> int:
-        """Number of coefficients that outputs list; the others only shape the effect."""
+        """Number of reported coefficients; the others only shape the effect."""
         choice, names = self.choice, [name.partition(":")[2] for name in self.additions.names]
         fitted = [FittedCoefficient(name, "", 0.0, 1.0, 1.0) for name in names]
         listed = {c.name for c in library()[choice.family].reported(choice.settings, tuple(fitted))}
@@ -100,13 +100,13 @@ class ScoredEffect:
 
 
 class Screen:
-    """Products of the columns of all candidates in the projected space, so that any set of them is scored at once.
+    """Products of the columns of all candidates in the projected space, from which any set of them is scored.
 
     Args:
         projection: the projected space.
         candidates: the effects.
-        products: of the blocks of their columns, one for each distinct variant in order; those of the projection by
-            default.
+        products: products of blocks of columns, one block for each distinct variant in order; by default those of the
+            projection.
     """
 
     def __init__(
@@ -126,12 +126,17 @@ class Screen:
         self._products = ProjectedProducts(projection, blocks) if products is None else products
 
     def columns(self, candidate: int, option: int) -> Floats:
-        """Return (3 m, k) the projected columns of a variant."""
+        """Return (3 m, k) the projected columns of a variant.
+
+        Args:
+            candidate: number of the candidate.
+            option: number of its variant.
+        """
         additions = self._blocks[self._block[candidate, option]]
         return self.projection.columns(self.projection.moved_mm(additions))
 
     def distinct(self, candidate: int) -> tuple[tuple[int, ...], ...]:
-        """Return the variants of a candidate, grouped where they differ in their prior alone."""
+        """Return the variants of a candidate, in groups that differ only in their prior."""
         found: dict[int, list[int]] = {}
         for option in range(len(self.candidates[candidate].options)):
             found.setdefault(self._block[candidate, option], []).append(option)
@@ -141,8 +146,8 @@ class Screen:
         """Return the log Bayes factor of several variants together against no effect.
 
         Args:
-            chosen: (candidate, option) of each.
-            scales: of the plausible sizes of each; 1 by default.
+            chosen: (candidate, option) of each variant.
+            scales: factors on the plausible sizes of each; 1 by default.
         """
         blocks = [self._block[which] for which in chosen]
         gram = np.block([[self._products.product(a, b) for b in blocks] for a in blocks])
@@ -155,17 +160,19 @@ class Screen:
         )
         return from_products(gram, along, sigma)
 
-    def beside(self, chosen: Mapping[int, tuple[int, float]]) -> Beside:
-        """Return the log Bayes factors of candidates in addition to others.
+    def given(self, chosen: Mapping[int, tuple[int, float]]) -> ConditionalScores:
+        """Return the scores of candidates given other candidates.
 
         Args:
-            chosen: number of each of the others -> its variant and scale.
+            chosen: number of each given candidate -> its variant and scale.
         """
         own = [
             (self._block[number, option], self._sigma(number, option, scale))
             for number, (option, scale) in chosen.items()
         ]
-        return Beside(self, [block for block, _ in own], np.concatenate([np.empty(0), *(sigma for _, sigma in own)]))
+        return ConditionalScores(
+            self, [block for block, _ in own], np.concatenate([np.empty(0), *(sigma for _, sigma in own)])
+        )
 
     def _sigma(self, candidate: int, option: int, scale: float) -> Floats:
         sigma: Floats = self.candidates[candidate].additions[option].prior_sigma * scale
@@ -177,10 +184,10 @@ class Screen:
         return self.log_bayes_factor(chosen, [w.scale for w in scored])
 
     def score(self, without: Collection[str] = ()) -> tuple[ScoredEffect, ...]:
-        """Score all candidates, sorted by the most probable model that has them.
+        """Score all candidates, sorted by the most probable model that includes them.
 
-        Of a pair the one that shows more by itself comes first: two similar effects share the probability of the one
-        that is there, and a small effect added to either of them would keep all of its own.
+        Of a pair, the effect with the larger individual evidence comes first. Posterior probabilities would not give
+        this order: two similar effects share their probability, while a small effect paired with either keeps its own.
 
         Args:
             without: `family@where` of candidates to leave out.
@@ -206,9 +213,14 @@ class Screen:
         return tuple(sorted(scored, key=lambda w: (-w.log_evidence, -w.log_bayes_factor, str(w.candidate))))
 
     def forms(self, scored: ScoredEffect, least: float) -> Iterator[ScoredEffect]:
-        """Yield a scored effect in its other forms, finer ones aside, with at least this log Bayes factor."""
-        choice, situation = scored.choice, self.projection.situation
-        if library()[choice.family].refined(situation, choice.where, choice.settings):
+        """Yield a scored effect in its other variants; none if the effect can be refined.
+
+        Args:
+            scored: the effect in its best variant.
+            least: smallest log Bayes factor of the variants to yield.
+        """
+        choice, context = scored.choice, self.projection.context
+        if library()[choice.family].refined(context, choice.where, choice.settings):
             return
         number = self._number[id(scored.candidate)]
         values, odds, likelihood = self._values(number)
@@ -219,26 +231,26 @@ class Screen:
                 yield self._score_best(number, of_form, odds, likelihood)
 
     def _score_one(self, number: int) -> ScoredEffect:
-        """Score one candidate without its strained variants, as long as these would be the best.
+        """Score one candidate, excluding best variants of implausible shape.
 
-        Variants whose coefficients are beyond their limits are left out where another explains the data as well: of
-        forms that mirror or outgrow each other, only the sign and the size of the coefficients say which it is.
+        Variants whose coefficients exceed their limits are also excluded if a different variant explains the data as
+        well. Variants that are mirrored or scaled versions of each other differ only in sign and size of coefficients.
         """
         values, odds, likelihood = self._values(number)
         while True:
             found = self._score_best(number, values, odds, likelihood)
             estimate, error = found.estimate, found.standard_error
-            is_strained = found.choice.strained(estimate, error)
-            if not is_strained and not found.choice.beyond(self.projection.situation, estimate, error):
+            is_implausible = found.choice.has_implausible_shape(estimate, error)
+            if not is_implausible and not found.choice.beyond_limits(self.projection.context, estimate, error):
                 return found
             rest = values.copy()
             rest[found.option] = -math.inf
-            if rest.max() < (-math.inf if is_strained else values.max() - _EQUAL) or np.isneginf(rest).all():
+            if rest.max() < (-math.inf if is_implausible else values.max() - _EQUAL) or np.isneginf(rest).all():
                 return found
             values = rest
 
     def _values(self, number: int) -> tuple[Floats, Floats, float]:
-        """Return (options, scales) log evidence and prior odds of a candidate, and its log likelihood ratio."""
+        """Return log evidence and prior odds (options, scales) of a candidate, and its log likelihood ratio."""
         candidate = self.candidates[number]
         by_size: dict[int, list[int]] = {}
         for option, additions in enumerate(candidate.additions):
@@ -274,9 +286,9 @@ class Screen:
         )
 
     def _at_scales(self, number: int, options: Sequence[int]) -> tuple[Floats, Floats]:
-        """Return (v, scales) log Bayes factors of v variants with equally many coefficients, each by itself.
+        """Return log Bayes factors (v, scales) of v variants with equally many coefficients, each alone.
 
-        With them come the (v,) squares that each explains at most.
+        The second result is the largest sum of squares (v,) that each explains.
         """
         blocks = {self._block[number, option]: option for option in reversed(options)}
         new = {block: option for block, option in blocks.items() if block not in self._eigen_of}
@@ -291,10 +303,10 @@ class Screen:
         return values, (along_one**2 / np.where(seen, one, np.inf)).sum(axis=1)
 
     def _eigen(self, number: int, option: int) -> tuple[Floats, Floats, Floats]:
-        """Return eigenvalues (k,) and axes (k, k) of a variant's G'G in prior sigmas, and G'r along these axes."""
+        """Return eigenvalues (k,) and eigenvectors (k, k) of a variant's G'G in prior sigmas, and G'r along these."""
         block = self._block[number, option]
         sigma = self.candidates[number].additions[option].prior_sigma
-        if block in self._eigen_of:  # variants that differ in one factor on their sigmas have the same axes
+        if block in self._eigen_of:  # variants whose sigmas differ by a common factor have the same eigenvectors
             of, size, axes, along = self._eigen_of[block]
             factor = sigma[0] / of[0]
             if (np.abs(sigma - factor * of) <= _ROUNDING * factor * of).all():
@@ -303,7 +315,7 @@ class Screen:
         return self._eigen_of[block][1:]
 
     def _factor(self, sigma_of: Mapping[int, Floats]) -> None:
-        """Compute at once what `_eigen` returns of blocks with equally many columns, each with its prior sigmas."""
+        """Compute the results of `_eigen` for several blocks with equally many columns at once, given prior sigmas."""
         sigma = np.array(list(sigma_of.values()))
         gram = np.array([self._products.product(block, block) for block in sigma_of])
         sizes, axes = np.linalg.eigh(gram * sigma[:, None] * sigma[:, :, None])
@@ -312,11 +324,11 @@ class Screen:
             self._eigen_of[block] = sigma[place], np.maximum(sizes[place], 0.0), axes[place], along
 
 
-class Beside:
-    """Log Bayes factors of candidates in addition to others: these are factored once, by `Screen.beside`.
+class ConditionalScores:
+    """Scores of candidates given other candidates, whose products are factored once by `Screen.given`.
 
     Attributes:
-        log_bayes_factor: of the others together against no effect; 0 for none.
+        log_bayes_factor: log Bayes factor of the given candidates together against no effect; 0 for none.
     """
 
     def __init__(self, screen: Screen, blocks: Sequence[int], sigma: Floats) -> None:
@@ -327,7 +339,13 @@ class Beside:
         self._left: dict[int, tuple[Floats, Floats]] = {}
 
     def together(self, candidate: int, option: int, scale: float) -> float:
-        """Return the log Bayes factor of a variant and the others against no effect."""
+        """Return the log Bayes factor of a variant together with the given candidates against no effect.
+
+        Args:
+            candidate: number of the candidate.
+            option: number of its variant.
+            scale: factor on its plausible sizes.
+        """
         block = self._screen._block[candidate, option]
         if block not in self._left:
             removed = self._solved(self._across([block]))
@@ -336,7 +354,7 @@ class Beside:
         return self.log_bayes_factor + from_products(*self._left[block], self._screen._sigma(candidate, option, scale))
 
     def _across(self, blocks: Sequence[int]) -> Floats:
-        """Return (q, k) products of the others' columns, in prior sigmas, with those of some blocks."""
+        """Return products (q, k) of the given candidates' columns, in prior sigmas, with those of some blocks."""
         rows = [np.hstack([self._screen._products.product(a, b) for b in blocks]) for a in self._others]
         if not rows:
             return np.empty((0, sum(len(self._screen._products.along(b)) for b in blocks)))
@@ -344,30 +362,30 @@ class Beside:
         return stacked
 
     def _solved(self, right: Floats) -> Floats:
-        """Return the factor's inverse times a right-hand side (q,) or (q, k)."""
+        """Solve the triangular system of the factor for a right-hand side (q,) or (q, k)."""
         if not len(right):
             return right
         return np.asarray(solve_triangular(self._factor, right, lower=True, check_finite=False))
 
 
 def _log_sum(values: Floats | Sequence[float]) -> float:
-    """Return the logarithm of the sum of exponentials; SciPy's function takes a hundred times as long for so few."""
+    """Return the logarithm of a sum of exponentials; SciPy's function is a hundred times slower for few values."""
     return float(np.logaddexp.reduce(np.ravel(values)))
 
 
 def _explained(size: Floats, along: Floats) -> tuple[float, int]:
-    """Return the squares that columns explain and their rank, from the eigenvalues (k,) of G'G and G'r along these."""
+    """Return the squares that columns explain and their rank, from eigenvalues (k,) of G'G and G'r along these."""
     seen = _is_seen(size)
     return float((along[seen] ** 2 / size[seen]).sum()), int(seen.sum())
 
 
 def _is_seen(size: Floats) -> NDArray[np.bool_]:
-    """Return which of rising eigenvalues (..., k) are more than rounding."""
+    """Return a mask of the rising eigenvalues (..., k) that are above rounding errors."""
     return size > _SEEN * np.maximum(size[..., -1:], _TINY)
 
 
 def by_family(scored: Iterable[ScoredEffect]) -> dict[str, float]:
-    """Return family -> posterior, the greatest first; a family at several places at once counts once."""
+    """Return family -> posterior summed over its places, at most 1, greatest first."""
     found: dict[str, float] = {}
     for w in scored:
         found[w.candidate.family] = min(1.0, found.get(w.candidate.family, 0.0) + w.posterior)

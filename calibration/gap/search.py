@@ -1,4 +1,4 @@
-"""The search for missing effects: in all rows, in a part of them, and beside structure that no library has."""
+"""The search for missing effects: in all rows, in a part of the rows, and in the presence of unexplained structure."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import numpy as np
 from calibration.gap.adoption import Adopted, adopted
 from calibration.gap.background.blocks import displacement_blocks, possible_blocks, smooth_blocks, time_blocks
 from calibration.gap.background.breaks import find_break
-from calibration.gap.background.causes import names_beside_cause
-from calibration.gap.background.naming import Names, evidence_alone, names_beside
+from calibration.gap.background.causes import names_given_cause
+from calibration.gap.background.naming import Names, evidence_alone, names_given_background
 from calibration.gap.background.outside import (
     MOST_FORMULAS,
     cost_with_formulas,
@@ -19,7 +19,7 @@ from calibration.gap.background.outside import (
     formulas_log_bayes_factor,
     formulas_suffice,
     is_in_library,
-    what_is_left,
+    residual_formula,
 )
 from calibration.gap.background.search import background_log_bayes_factor
 from calibration.gap.detection import detect
@@ -35,8 +35,8 @@ from calibration.identification.refinement import Prior
 from calibration.identification.solve import Solution
 from calibration.observations import Observations
 
-_REGIME = 15.0  # log Bayes factor, for an effect in a part of the data: its variable and its border are chosen
-_LEAST_SAMPLES = 60  # for the evidence of a background to be more than that of a few fixes
+_REGIME = 15.0  # log Bayes factor required of an effect in a part of the data, as variable and border are selected
+_LEAST_SAMPLES = 60  # with fewer samples, the evidence of a background may come from a few fixes
 
 
 def search(
@@ -47,27 +47,27 @@ def search(
     prior: Prior = "recalibration",
     seed: int = 0,
 ) -> SearchResult:
-    """Find the effects that the data ask for.
+    """Find the effects that the data require.
 
     Args:
         solution: the kinematics alone, fitted to `observations`.
         observations: the rows.
-        families: of effects that may be named.
-        prior: of the solution.
-        seed: of half-samples and folds.
+        families: families of effects that may be named.
+        prior: prior of the solution.
+        seed: random seed of half-samples and folds.
     """
     seen = in_true_steps(solution, observations, prior)
     problem = Problem(seen, observations, prior, seed)
     whole = StepwiseSearch(problem, families)
     found = _in_regimes(problem, families, whole.run(), whole.least_cost)
-    found = _beside_background(problem, families, found)
+    found = _with_background(problem, families, found)
     broken = find_break(problem, found.joint)
     if broken is not None:
         by_formulas = formulas_log_bayes_factor(problem, found.joint, found.strongest_formula)
         found = replace(found, machine_break=broken if broken.log_bayes_factor > by_formulas else None)
     if seen is solution:
         return found
-    # A model counts the noise of readings as its rig file has it, and what is beyond that as scatter.
+    # The model uses the reading noise of its rig file, and counts additional noise as scatter.
     if not found.joint.choices:
         return replace(found, adopted=Adopted(solution, solution.fit, reason=found.adopted.reason))
     joint = joint_fit(solution, observations, found.joint.choices, prior, found.joint.fit.x)
@@ -75,17 +75,17 @@ def search(
 
 
 def _in_regimes(problem: Problem, families: Collection[str], found: SearchResult, least_cost: float) -> SearchResult:
-    """Return a result with an effect that acts in a part of the data, where that leaves noise and is the likelier one.
+    """Return a result with an effect in a part of the data, if it is more probable and leaves only noise.
 
-    Rows in which it acts may seem to be outliers to anything else, so that all rows count where there are many such.
-
-    Where one effect or none leaves nothing but noise, only that one may be better off in a part of the data.
+    The rows in which it acts may look like outliers without it, so a fit in which all rows have full weight is also
+    tried where there are many outliers. If at most one effect in all rows leaves only noise, the search in parts is
+    first limited to the family of this effect, and ends if that is no improvement.
 
     Args:
         problem: the data.
-        families: of effects that may be named.
-        found: with effects that act in all rows.
-        least_cost: of the fits that led to it, also of those with effects that it was not sure of.
+        families: families of effects that may be named.
+        found: the result with effects that act in all rows.
+        least_cost: smallest cost of all fits of that search, including those with uncertain effects.
     """
     alone, like = problem.with_mild_outliers(problem.kinematics_only()), found.candidates.candidates
     if len(found.joint.choices) <= 1 and _leaves_noise(problem, found):
@@ -106,7 +106,7 @@ def _in_regimes(problem: Problem, families: Collection[str], found: SearchResult
         if with_formulas - one.joint.fit.cost < _REGIME:
             continue
         if is_last and detect(Grammar(problem.project(one.joint)), problem.rng()).significant:
-            continue  # all others are there already
+            continue  # all other effects are already in the fit, so only noise may be left
         tried = StepwiseSearch(problem, families, one).run()
         if tried.joint.choices and _leaves_noise(problem, tried):
             return tried
@@ -114,35 +114,36 @@ def _in_regimes(problem: Problem, families: Collection[str], found: SearchResult
 
 
 def _leaves_noise(problem: Problem, found: SearchResult) -> bool:
-    """True if nothing is left that has no name."""
+    """Return True if a result leaves only noise."""
     is_open = found.alternatives or found.formulas or found.outside_library
     return not is_open and not detect(found.final, problem.rng()).significant
 
 
-def _beside_background(problem: Problem, families: Collection[str], found: SearchResult) -> SearchResult:
-    """Return a result with the effects that are beyond doubt beside structure that no library has, if there are any.
+def _with_background(problem: Problem, families: Collection[str], found: SearchResult) -> SearchResult:
+    """Return a result with the effects that are certain given a background of unexplained structure.
 
     Args:
         problem: the data.
-        families: of effects that may be named.
-        found: without a background; it stays as it is where it leaves nothing but noise, or nothing more is certain.
+        families: families of effects that may be named.
+        found: the result without a background. Its effects are kept if it leaves only noise, or if no effect is certain
+            given a background.
     """
     names, formulas = _names(problem, families, found)
     known = found.joint.choices if names is None else names.joint.choices or found.joint.choices
-    is_path = follows_path(problem.solution.samples)  # what wanders along it imitates causes, too
-    of_cause = None if is_path else names_beside_cause(problem, families, known, is_open=names is not None)
+    is_path = follows_path(problem.solution.samples)  # drift along a path imitates causes too
+    of_cause = None if is_path else names_given_cause(problem, families, known, is_open=names is not None)
     names, formulas = (names, formulas) if of_cause is None else (of_cause, ())
     is_doubted = is_path and names is not None
     if names is None or not (names.joint.choices or of_cause or is_doubted):
         smooth = None if formulas else names
-        return replace(found, evidence=evidence_alone(problem, found.joint, families), beside=smooth)
+        return replace(found, evidence=evidence_alone(problem, found.joint, families), given_background=smooth)
     joint, first = names.joint, found.steps[0]
     last = problem.project(joint)
     posterior = {name: own.posterior for name, own in names.evidence.items()}
     of_family = by_family(names.left) | {c.family: posterior[str(c)] for c in joint.choices}
     listed = ", ".join(map(str, joint.choices))
     reason = (
-        f"the data ask for {listed}, whatever else is there" if listed else "nothing is certain beside what wanders"
+        f"the data require {listed}, whatever else is present" if listed else "nothing is certain in addition to drift"
     )
     return SearchResult(
         problem,
@@ -167,20 +168,20 @@ def _beside_background(problem: Problem, families: Collection[str], found: Searc
 def _names(
     problem: Problem, families: Collection[str], found: SearchResult
 ) -> tuple[Names | None, tuple[Formula, ...]]:
-    """Return the names beside structure that no library has, None where a search has left nothing but noise.
+    """Return the names given a background of unexplained structure, or None if the search left only noise.
 
-    One effect outside the library is a formula, or two, that leave nothing; names are sought beside these, which are
-    returned as well. Where formulas do not explain all that is left they may stand for anything, and names are sought
-    beside a smooth unknown.
+    An effect outside the library is described by one or a few formulas that leave only noise. The names are then found
+    given these formulas, which are returned too. If formulas do not explain all residuals, their meaning is uncertain,
+    and the names are found given a smooth background instead.
     """
-    known, context, average = found.joint.choices, found.joint.situation, problem.solution.samples.average
+    known, context, average = found.joint.choices, found.joint.context, problem.solution.samples.average
     smooth = smooth_blocks(context, average)
     if follows_path(problem.solution.samples):
-        # Errors that wander with time look like any effect whose pattern changes slowly along a path.
-        wandering = [*(block for block in smooth if block.kind != "time"), *time_blocks(context, average, fine=True)]
-        return names_beside(problem, wandering, families, known), ()
+        # Drift with time resembles any effect whose pattern changes slowly along a path.
+        drifting = [*(block for block in smooth if block.kind != "time"), *time_blocks(context, average, fine=True)]
+        return names_given_background(problem, drifting, families, known), ()
     final = found.final
-    if found.alternatives:  # one of them is there, which explains what it explains
+    if found.alternatives:  # one of them exists, so its part is explained
         tried = problem.fit([*known, found.alternatives[0].choice], found.joint.fit.x)
         final = Grammar(problem.project(tried))
     if not found.outside_library and not detect(final, problem.rng()).significant:
@@ -189,18 +190,20 @@ def _names(
         wide = [*smooth, *displacement_blocks(context, average)]
         if background_log_bayes_factor(problem, found.joint, wide) < STRUCTURE:
             return None, ()
-        names = names_beside(problem, smooth, families, known)
+        names = names_given_background(problem, smooth, families, known)
         left = background_log_bayes_factor(problem, names.joint, wide)
         return replace(names, background_log_bayes_factor=left), ()
     if not found.needs_background and formulas_suffice(problem, found.joint, found.strongest_formula):
         further, formulas = found.strongest_formula, tuple[Formula, ...]()
         for number in range(MOST_FORMULAS):
             new = tuple(f for f in further if not is_in_library(f, found.candidates.candidates, found.initial))
-            if number and not new:  # what is left is of the library, which has been asked beside these
+            if number and not new:  # the remaining formulas are library effects, which were already tried given these
                 break
             formulas += new
-            names = names_beside(problem, [formula_block(f, n) for n, f in enumerate(formulas)], families, known)
-            further = what_is_left(problem, names.joint, formulas)
+            names = names_given_background(
+                problem, [formula_block(f, n) for n, f in enumerate(formulas)], families, known
+            )
+            further = residual_formula(problem, names.joint, formulas)
             if not further:
                 return names, formulas
-    return names_beside(problem, smooth, families, known, lambda: possible_blocks(context, average)), ()
+    return names_given_background(problem, smooth, families, known, lambda: possible_blocks(context, average)), ()

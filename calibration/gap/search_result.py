@@ -1,8 +1,8 @@
 """The result of a search: the effects that close the gap, and the errors that remain when they are adopted.
 
-Effects must close the gap that the kinematics alone leave beyond the noise, and none may be a part of something else: a
-name for a part of something else is a wrong name. The noise is known from the station and the rig file only as far as
-both tell the truth: sigmas are rarely right to better than a tenth.
+Effects must close the gap, the errors of the kinematics alone beyond the noise. An effect that describes only a part of
+a different cause is not named, as its name would be wrong. The noise follows from the sigmas of station and rig file,
+which are rarely accurate to better than 10 %.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from calibration.effects.fitted import Choice
 from calibration.gap.adoption import Adopted, adopted
 from calibration.gap.background.naming import Names
 from calibration.gap.candidates import CandidateEffects
-from calibration.gap.criteria import beyond, explains, stands_for
+from calibration.gap.criteria import beyond_limits, explains, is_equivalent
 from calibration.gap.detection import Detection, detect
 from calibration.gap.formulas.grammar import Formula, Grammar, describe
 from calibration.gap.formulas.terms import modulations
@@ -29,16 +29,16 @@ from calibration.gap.result import Break, Evidence
 from calibration.gap.screening import ScoredEffect, Screen
 from calibration.observations import Floats
 
-_CLOSED = 0.8  # of the gap, at least
-_LEFT = 0.05  # of what an effect and the remaining errors together explain, at most
-_HIGH = 6.0  # standard errors of the variance that the gap must have to be judged
-_MISJUDGED = 0.1  # share by which a sigma may be off
-_FAR_MISJUDGED = 1.0  # the same where nothing says that it is anything but noise
-COMPARED = 12  # effects that are held against a formula
-_ANY_SIZE = 1e3  # of the plausible sizes of an effect
-STRUCTURE = 12.0  # log Bayes factor of a background that is more than chance
-_LISTED = 4  # parts of a background
-_WORTH_TELLING = 0.3  # of the largest part
+_CLOSED = 0.8  # share of the gap that effects must close
+_LEFT = 0.05  # a variation of the coefficient is ignored below this share of the squares of effect and variation
+_HIGH = 6.0  # size of the gap, in standard errors of the variance, below which it is too small to assess
+_SIGMA_ERROR = 0.1  # relative error that sigmas may have
+_LARGE_SIGMA_ERROR = 1.0  # the same if the remaining errors have no structure
+COMPARED = 12  # number of effects that are compared with a formula
+_ANY_SIZE = 1e3  # factor on plausible sizes to allow any size
+STRUCTURE = 12.0  # log Bayes factor from which on a background is significant
+_LISTED = 4  # largest number of parts of a background to list
+_LEAST_SHARE = 0.3  # parts below this share of the largest are not listed
 
 
 @dataclass(frozen=True)
@@ -46,12 +46,12 @@ class SelectionStep:
     """One step of the search.
 
     Attributes:
-        fit: kinematics and effects at its beginning.
-        projection: about that fit.
-        scored: the most probable candidates, in their order.
-        posterior: family -> probability that it is there.
-        adopted: one effect, at one place or several; none in the last step.
-        reasons: `family@where` -> why it was not named, a clause.
+        fit: kinematics and effects at the start of the step.
+        projection: projection at that fit.
+        scored: the most probable candidates, in order.
+        posterior: family -> posterior probability.
+        adopted: the adopted effect, at one or several places; empty in the last step.
+        reasons: `family@where` -> clause that explains why it was not named.
     """
 
     fit: JointFit
@@ -69,20 +69,20 @@ class SearchResult:
     Attributes:
         problem: the data.
         adopted: kinematics and effects.
-        joint: their fit.
-        steps: in their order, each about the fit at that time; the last adopts nothing.
-        alternatives: of the set that is pending, the most probable first; none where nothing is.
-        formulas: of the grammar, where they explain the remaining errors better than all of the library.
-        outside_library: of the grammar, those that beat the library after all that had been named by then, even if that
-            was taken back; `formulas` by default.
+        joint: the fit of kinematics and effects.
+        steps: the steps in order, each at the fit of that time; the last one adopts nothing.
+        alternatives: the effects of a set that cannot be distinguished, the most probable first; empty for none.
+        formulas: formulas that explain the remaining errors better than any effect of the library.
+        outside_library: formulas that were better than the library given all effects adopted at that time, even if
+            these were removed later; `formulas` by default.
         posterior: `family@where` of each adopted effect -> posterior of its family when it was adopted.
-        candidates: all candidates at the beginning, and what the data lack for others.
-        initial: the projection about the kinematics alone.
-        final: all terms on which the remaining errors may depend.
+        candidates: all candidates at the start, and the reasons why other families are excluded.
+        initial: projection at the kinematics alone.
+        final: grammar of the remaining errors.
         evidence: `family@where` of each adopted effect -> its evidence given all others.
-        beside: what is certain beside a background; None where no background was needed.
-        machine_break: an instant after which the machine is another; None for none.
-        needs_background: True if it is known that more is left than a few formulas say.
+        given_background: the effects that are certain given a background; None if no background was needed.
+        machine_break: an instant after which the machine is different; None for none.
+        needs_background: True if a few formulas are known not to explain the remaining errors.
     """
 
     problem: Problem
@@ -97,17 +97,17 @@ class SearchResult:
     initial: Projection
     final: Grammar
     evidence: Mapping[str, Evidence] = field(default_factory=dict)
-    beside: Names | None = None
+    given_background: Names | None = None
     machine_break: Break | None = None
     needs_background: bool = False
 
     @property
     def strongest_formula(self) -> tuple[Formula, ...]:
-        """The formula that says most of what is left, if any does."""
+        """The formula that best describes the remaining errors, or empty."""
         return (self.outside_library or self.final.find())[:1]
 
     def refitted_steps(self) -> tuple[SelectionStep, ...]:
-        """Return the steps, each about a fit of what those before it adopted, without what was taken back later."""
+        """Return the steps, each at a fit of the effects adopted before it, without effects removed later."""
         there, steps = set[str](), list[SelectionStep]()
         for step in self.steps:
             before = sorted((c for c in step.fit.choices if str(c) in there), key=str)
@@ -131,17 +131,17 @@ def conclude(
     posterior: Mapping[str, float],
     candidates: CandidateEffects,
 ) -> SearchResult:
-    """Return the result with those effects alone that close the gap and are no part of something else.
+    """Return the result with only those effects that close the gap and are not part of a different cause.
 
     Args:
         problem: the data.
-        joint: kinematics with all effects that were adopted.
-        alone: kinematics alone.
-        steps: in their order.
-        alternatives: of the set that is pending.
-        formulas: that explain the remaining errors better than all of the library.
+        joint: kinematics with all adopted effects.
+        alone: the step of the kinematics alone.
+        steps: all steps in order.
+        alternatives: effects of a set that cannot be distinguished.
+        formulas: formulas that explain the remaining errors better than any effect of the library.
         posterior: `family@where` -> posterior of its family when it was adopted.
-        candidates: all candidates at the beginning.
+        candidates: all candidates at the start.
     """
     solution = problem.solution
     alternatives = alternatives if _may_close(problem, alone.projection, joint, alternatives) else ()
@@ -155,9 +155,9 @@ def conclude(
     initial, is_structured = kept[0].projection, bool(formulas)
     if joint.choices and not alternatives and not _closes(problem, initial, final, is_structured=is_structured):
         return _no_effect(problem, kept, outside_library or formulas, candidates)
-    outcome = Adopted(solution, solution.fit, reason="nothing stands out of the noise that could be named")
+    outcome = Adopted(solution, solution.fit, reason="no effect that could be named stands out of the noise")
     if joint.choices:
-        outcome = adopted(solution, joint, f"the data ask for {', '.join(map(str, joint.choices))}")
+        outcome = adopted(solution, joint, f"the data require {', '.join(map(str, joint.choices))}")
     return SearchResult(
         problem,
         outcome,
@@ -174,7 +174,7 @@ def conclude(
 
 
 def _may_close(problem: Problem, initial: Projection, joint: JointFit, alternatives: Sequence[ScoredEffect]) -> bool:
-    """True if the gap closes with the most probable of a set, which is held to what a name is held to."""
+    """Return True if the most probable effect of a set would close the gap, as required of a named effect."""
     if not alternatives:
         return False
     tried = problem.fit([*joint.choices, alternatives[0].choice], joint.fit.x)
@@ -182,7 +182,7 @@ def _may_close(problem: Problem, initial: Projection, joint: JointFit, alternati
 
 
 def _closes(problem: Problem, initial: Projection, final: Grammar, *, is_structured: bool) -> bool:
-    """`closes_gap`, detecting whether the remaining errors depend on anything unless that is known already."""
+    """Return `closes_gap`, after testing the remaining errors for structure unless it is already known."""
     structured = is_structured or detect(final, problem.rng()).significant
     return closes_gap(initial, final.projection, problem.solution.fit.weight, is_structured=structured)
 
@@ -190,10 +190,10 @@ def _closes(problem: Problem, initial: Projection, final: Grammar, *, is_structu
 def _without_partial_effects(
     problem: Problem, joint: JointFit, alternatives: Sequence[ScoredEffect]
 ) -> tuple[JointFit, dict[str, str]]:
-    """Return the fit without effects that are a part of something else; `family@where` of those -> why, a clause."""
+    """Return the fit without effects that are part of a different cause, and `family@where` -> reason for these."""
     if not joint.choices:
         return joint, {}
-    # Where one of several is there, but nobody knows which, the most probable one is.
+    # For a set that cannot be distinguished, assume its most probable effect.
     tried = problem.fit([*joint.choices, alternatives[0].choice], joint.fit.x) if alternatives else joint
     over = problem.project(tried)
     found = {str(c): dependence(tried, n, over, problem.rng()) for n, c in enumerate(joint.choices)}
@@ -207,19 +207,19 @@ def _without_partial_effects(
 def _final_steps(
     steps: Sequence[SelectionStep], alone: SelectionStep, last: JointFit, against: Mapping[str, str]
 ) -> list[SelectionStep]:
-    """Return the steps without effects that were taken back, the first about the kinematics alone.
+    """Return the steps without effects that were removed, the first one at the kinematics alone.
 
     Args:
-        steps: in their order.
-        alone: kinematics alone.
+        steps: all steps in order.
+        alone: the step of the kinematics alone.
         last: the final fit.
-        against: `family@where` -> why it was taken back, a clause; what was found after it by default.
+        against: `family@where` -> clause with the reason of removal; by default, later effects made it superfluous.
     """
     kept, final = {str(c) for c in last.choices}, []
     for step in steps:
         own = tuple(c for c in step.adopted if str(c) in kept)
         dropped = {
-            str(c): against.get(str(c), "what was found after it makes it superfluous")
+            str(c): against.get(str(c), "effects found after it make it superfluous")
             for c in step.adopted
             if c not in own
         }
@@ -231,14 +231,14 @@ def _final_steps(
 def _no_effect(
     problem: Problem, steps: Sequence[SelectionStep], formulas: tuple[Formula, ...], candidates: CandidateEffects
 ) -> SearchResult:
-    """Return a result without effects: what the library has closes a part of the gap, so it is something else."""
-    reasons = {str(c): "it closes a part of the gap only" for step in steps for c in step.adopted}
+    """Return a result without effects, as library effects close only a part of the gap and so are not the cause."""
+    reasons = {str(c): "it closes only a part of the gap" for step in steps for c in step.adopted}
     step = replace(steps[0], adopted=(), reasons={**steps[0].reasons, **reasons})
     solution, final = problem.solution, Grammar(step.projection)
     found = final.find()
     return SearchResult(
         problem,
-        Adopted(solution, solution.fit, reason="what could be named closes a part of the gap only"),
+        Adopted(solution, solution.fit, reason="the effects that could be named close only a part of the gap"),
         step.fit,
         (step,),
         (),
@@ -252,42 +252,43 @@ def _no_effect(
 
 
 def closes_gap(initial: Projection, last: Projection, weight: Floats, *, is_structured: bool) -> bool:
-    """True if the effects adopted between two projections close the gap, or the gap is too small to tell.
+    """Return True if the effects adopted between two projections close the gap, or if the gap is too small to assess.
 
-    Fixes that are no outliers to the kinematics alone are part of the gap: where it is closed for most of them and the
-    others become outliers, it is not closed.
+    Fixes that are not outliers to the kinematics alone are part of the gap. If the effects make some of them outliers,
+    their errors count as remaining.
 
     Args:
-        initial: of the kinematics alone.
-        last: with all effects.
-        weight: (m,) of the samples in the fit of the kinematics alone.
-        is_structured: the remaining errors depend on something; if not, they may be noise far larger than assumed.
+        initial: projection at the kinematics alone.
+        last: projection with all effects.
+        weight: (m,) weights of the samples in the fit of the kinematics alone.
+        is_structured: True if the remaining errors depend on a variable; if not, they may be noise larger than assumed.
     """
-    noise = last.samples.variance(last.situation.rig, last.joint_jacobian)
-    misjudged = _MISJUDGED if is_structured else _FAR_MISJUDGED
+    noise = last.samples.variance(last.context.rig, last.joint_jacobian)
+    misjudged = _SIGMA_ERROR if is_structured else _LARGE_SIGMA_ERROR
     allowed = noise * ((1.0 + misjudged) ** 2 - 1.0)
-    given_up = (weight >= OUTLIER) & (last.fit.weight < OUTLIER)
-    outside = float((last.error_mm[given_up] ** 2).sum()) / (3.0 * len(weight))
+    rejected = (weight >= OUTLIER) & (last.fit.weight < OUTLIER)
+    outside = float((last.error_mm[rejected] ** 2).sum()) / (3.0 * len(weight))
     gap, left = initial.fit.excess_variance - allowed, last.fit.excess_variance - allowed + outside
     standard_error = (noise + allowed) * math.sqrt(2.0 / (3.0 * float(last.fit.weight.sum())))
     return gap < _HIGH * standard_error or left < (1.0 - _CLOSED) * gap + standard_error
 
 
 def dependence(joint: JointFit, number: int, projection: Projection, rng: np.random.Generator) -> str:
-    """Return on what the coefficient of an effect depends, though it should be a constant; empty where it is one.
+    """Return the variable on which the coefficient of an effect depends; empty if it is constant, as it should be.
 
-    Something else was taken for the effect where the remaining errors have its pattern, but are larger in some poses or
-    at some times than in others: a beam for an elastic joint, friction for play, a knock for a drift.
+    If the remaining errors have the pattern of the effect, but are larger in some poses or at some times than in
+    others, then a different cause was mistaken for the effect: a beam for an elastic joint, friction for play, a knock
+    for a drift.
 
     Args:
         joint: kinematics and effects.
-        number: of the effect.
-        projection: about that fit.
-        rng: draws signs, as detection does.
+        number: number of the effect.
+        projection: projection at that fit.
+        rng: random generator for the signs of detection.
     """
     choice, part, own = joint.choices[number], joint.parts[number], joint.slice_of(number)
     value = joint.fit.x[own]
-    # Squares that nothing else explains: those of the coefficients in their posterior, less those in their prior.
+    # Squares that only this effect explains: those of the coefficients in their posterior minus those in their prior.
     explained = float(
         value @ np.linalg.solve(joint.fit.covariance[own, own], value) - ((value / part.prior_sigma) ** 2).sum()
     )
@@ -305,8 +306,8 @@ class Remaining:
 
     Attributes:
         found: the search.
-        detection: on what the errors still depend beyond chance.
-        description: the same as a formula, and what the library has to say to it; None where there is nothing to say.
+        detection: test for variables on which the errors still depend.
+        description: clause with a formula or the background, and the nearest effect of the library; None for none.
     """
 
     found: SearchResult
@@ -315,9 +316,9 @@ class Remaining:
 
     @property
     def significant(self) -> bool:
-        """True if anything is there that has no name."""
-        beside = self.found.beside
-        is_smooth = beside is not None and beside.background_log_bayes_factor > STRUCTURE
+        """True if there is structure without a name."""
+        names = self.found.given_background
+        is_smooth = names is not None and names.background_log_bayes_factor > STRUCTURE
         has_break = self.found.machine_break is not None
         return bool(
             self.detection.significant or self.found.alternatives or self.found.formulas or is_smooth or has_break
@@ -325,85 +326,85 @@ class Remaining:
 
     @property
     def adopted(self) -> Adopted:
-        """Kinematics and effects of the search, which say whether the remaining errors are structured."""
+        """Kinematics and effects of the search, with `structured` set."""
         return replace(self.found.adopted, structured=self.significant)
 
     def warnings(self) -> Iterator[str]:
-        """Yield sentences about effects that are there and that the model lacks, or may have at the wrong place."""
-        yield from self.open_places()
+        """Yield sentences about existing effects that the model lacks, or may have at the wrong place."""
+        yield from self.ambiguous_places()
         if self.found.alternatives:
             names = " or ".join(str(scored.candidate) for scored in self.found.alternatives)
             yield (
-                f"the data ask for {names} and cannot tell which, so none of them is in the model; `rigcal gap` "
-                f"proposes the poses that tell"
+                f"the data require one of {names} but cannot distinguish them, so none is in the model; `rigcal gap` "
+                f"proposes poses that distinguish them"
             )
         elif self.significant:
             what = "kinematics and effects" if self.found.adopted.effects else "the kinematics"
-            said = f": {self.description}" if self.description else ""
-            yield f"{what} leave more than noise, so the model lacks what could not be named{said}"
+            suffix = f": {self.description}" if self.description else ""
+            yield f"{what} leave more than noise, so the model lacks an effect that could not be named{suffix}"
 
-    def open_places(self) -> Iterator[str]:
-        """Yield sentences about places that are open, and about effects that held-out groups do not bear out."""
+    def ambiguous_places(self) -> Iterator[str]:
+        """Yield sentences about ambiguous places, and about effects that held-out groups do not confirm."""
         for name, own in self.found.evidence.items():
             others = [f"{where} ({p:.0%})" for where, p in own.places.items() if not name.endswith(f"@{where}")]
             if others:
                 yield f"{name}: these data do not exclude that it is at {' or '.join(others)} instead"
-        for name in self.found.beside.harmful if self.found.beside else ():
-            yield f"{name} seems to be there, but raises the errors of held-out groups, so the model lacks it"
+        for name in self.found.given_background.harmful if self.found.given_background else ():
+            yield f"{name} seems to exist, but increases the errors of held-out groups, so the model lacks it"
 
 
 def remaining(found: SearchResult, rng: np.random.Generator) -> Remaining:
-    """Test and describe the errors that a search has left.
+    """Test and describe the errors that remain after a search.
 
     Args:
-        found: the search.
-        rng: draws the signs of detection.
+        found: result of the search.
+        rng: random generator for the signs of detection.
     """
     final, detection = found.final, detect(found.final, rng)
     if found.machine_break is not None:
         return Remaining(found, detection, found.machine_break.text)
-    if found.beside is not None and found.beside.background and not found.formulas:
-        rest = Remaining(found, detection, _background_text(found.beside))
+    if found.given_background is not None and found.given_background.background and not found.formulas:
+        rest = Remaining(found, detection, _background_text(found.given_background))
         return rest if rest.significant else replace(rest, description=None)
     formulas = found.formulas or (final.find() if detection.significant and not found.alternatives else ())
-    description = describe(formulas, _library_says(found, formulas[0])) if formulas else None
+    description = describe(formulas, _library_clause(found, formulas[0])) if formulas else None
     if detection.significant and not (formulas or found.alternatives or found.adopted.effects):
         on = [f"{d.variable} ({d.where})" for d in detection.disagreements[:1]] or ["something"]
-        description = f"the errors depend on {on[0]} in a way that no formula of the grammar says"
+        description = f"the errors depend on {on[0]} in a way that no formula of the grammar describes"
     return Remaining(found, detection, description)
 
 
 def _background_text(names: Names) -> str:
-    """Return a clause: on what the rest depends, and the nearest effect of the library with its evidence."""
+    """Return a clause about the background: its parts, and the nearest effect of the library with its evidence."""
     most = names.background[0][1]
     parts = [
         f"{block.clause} ({rms_mm:.2g} mm RMS)"
         for block, rms_mm in names.background[:_LISTED]
-        if rms_mm > _WORTH_TELLING * most
+        if rms_mm > _LEAST_SHARE * most
     ]
     is_smooth = names.background[0][0].kind not in ("event", "elastic")
     nearest = [w for w in names.left if w.log_bayes_factor > 0.0][:1]
-    said = [_why_left(w, names.joint.situation) for w in nearest] or ["nothing in the library is like it"]
-    return "; ".join([f"{'smooth in ' if is_smooth else ''}{', '.join(parts)}", *said])
+    clauses = [_why_left(w, names.joint.context) for w in nearest] or ["no effect of the library is similar"]
+    return "; ".join([f"{'smooth in ' if is_smooth else ''}{', '.join(parts)}", *clauses])
 
 
-def _why_left(scored: ScoredEffect, situation: EffectContext) -> str:
-    """Return a clause: that an effect comes nearest to what is left, its evidence, and why it is not named."""
+def _why_left(scored: ScoredEffect, context: EffectContext) -> str:
+    """Return a clause about the nearest effect: its evidence, and why it is not named."""
     evidence = f"log Bayes factor {scored.log_bayes_factor:.1f}"
-    if names := beyond(situation, scored):
-        return f"{scored.candidate} comes nearest ({evidence}), but {', '.join(names)} would be beyond what is physical"
-    return f"{scored.candidate} comes nearest, with too little evidence ({evidence})"
+    if names := beyond_limits(context, scored):
+        return f"{scored.candidate} is nearest ({evidence}), but {', '.join(names)} would exceed its physical limits"
+    return f"{scored.candidate} is nearest, with too little evidence ({evidence})"
 
 
-def _library_says(found: SearchResult, formula: Formula) -> str:
-    """Return a clause: which effect that was not named would do what a formula says, if any."""
+def _library_clause(found: SearchResult, formula: Formula) -> str:
+    """Return a clause about an effect that is equivalent to a formula and why it was not named, if there is one."""
     step, projection = found.steps[-1], found.final.projection
     for scored in () if found.formulas else step.scored[:COMPARED]:
         if scored.log_bayes_factor > 0.0 and explains(scored, formula, projection):
             reason = step.reasons.get(str(scored.candidate), "it does not stand out enough to be named")
-            return f"{scored.candidate} would do this, but {reason}"
+            return f"{scored.candidate} would explain this, but {reason}"
     for scored in Screen(projection, found.candidates.candidates).score()[:COMPARED]:
-        names = beyond(projection.situation, scored)
-        if names and stands_for(replace(scored, scale=_ANY_SIZE), formula, projection):
-            return f"{scored.candidate} would do this, but {', '.join(names)} would be beyond what is physical"
+        names = beyond_limits(projection.context, scored)
+        if names and is_equivalent(replace(scored, scale=_ANY_SIZE), formula, projection):
+            return f"{scored.candidate} would explain this, but {', '.join(names)} would exceed its physical limits"
     return "not in the library"

@@ -221,7 +221,7 @@ def at_the_noise(chain: Chain, samples: Samples, fit: Fit) -> bool:
     ordinary = float(pull @ pull) < len(pull) + _CHANCE * math.sqrt(2.0 * len(pull))
     explained = fit.excess_variance < _NOISE**2 * _known_variance(chain, samples, fit)
     discarded = float((fit.weight < 0.5).mean())
-    return ordinary and explained and discarded < _FEW and fit.settled
+    return ordinary and explained and discarded < _FEW and fit.converged
 
 
 def beyond_assembly(chain: Chain, fit: Fit) -> bool:

@@ -42,22 +42,22 @@ def in_true_steps(solution: Solution, observations: Observations, prior: Prior) 
     return replace(solution, chain=chain, fit=refine(chain, solution.samples, solution.fit.x, prior=prior))
 
 
-def rounding(situation: EffectContext, left_mm: float) -> tuple[float, str | None]:
+def rounding(context: EffectContext, left_mm: float) -> tuple[float, str | None]:
     """Find readings that are rounded, where that makes a good part of the errors that a model leaves.
 
     Poses that were planned in whole steps and read in all digits leave far less than their steps would.
 
     Args:
-        situation: the rows.
+        context: the rows.
         left_mm: RMS 3-D error that the model leaves.
 
     Returns:
         RMS 3-D error by the rounding, mm, and a sentence; 0 and None where it makes no good part.
     """
-    rig = situation.rig
-    steps = _coarser(rig, situation.observations)
+    rig = context.rig
+    steps = _coarser(rig, context.observations)
     variance = np.array([steps.get(name, 0.0) ** 2 / 12.0 for name in rig.joint_names])
-    covariance = covariance_by_joints(situation.located.joint_jacobian, variance)
+    covariance = covariance_by_joints(context.located.joint_jacobian, variance)
     moves_mm = math.sqrt(float(np.trace(covariance, axis1=1, axis2=2).mean()))
     if not _PART * left_mm < moves_mm < left_mm / _PART:
         return 0.0, None

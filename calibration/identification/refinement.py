@@ -37,7 +37,7 @@ _OUTLIER_SHARE = (1e-3, 0.4)
 _PRIOR_SCALE = (0.1, 300.0)
 _AS_BUILT_SCALE = 30.0
 _DAMPING = (1e-9, 1e-4, 1e9)  # least, first after a refused step, greatest
-_SETTLED = 1e-3
+_CONVERGED = 1e-3
 _SAME_NOISE = 0.01  # share by which noise or prior may change before what depends little on them is computed again
 _LEAST_EXCESS = 1e-12
 
@@ -54,7 +54,7 @@ class Fit:
         prior_scale: what the build tolerances were multiplied by.
         weight: (m,) probability that a sample is no outlier.
         cost: negative log evidence at the solution; lower is better on the same samples.
-        settled: False if the iteration ended before it came to rest.
+        converged: False if the iteration ended before convergence.
         rounds: iterations that it took, 0 where a method does not count them.
     """
 
@@ -64,7 +64,7 @@ class Fit:
     prior_scale: float
     weight: Floats
     cost: float
-    settled: bool
+    converged: bool
     rounds: int = 0
 
 
@@ -281,9 +281,9 @@ def _fit(
     _require_finite(state.error)
     noise = _first_noise(state, prior) if like is None else _noise_of(like)
     noise = noise if excess_variance is None else replace(noise, excess=excess_variance)
-    damping, settled, rounds, weight = 0.0, False, 0, np.ones(len(model.order))
+    damping, converged, rounds, weight = 0.0, False, 0, np.ones(len(model.order))
     fitted_share, computed_at = 0.0, np.zeros(2)
-    while not settled and rounds < _ROUNDS:
+    while not converged and rounds < _ROUNDS:
         rounds += 1
         view = _Posterior(model, state, noise)
         step, size, moved = np.zeros(int(model.free.sum())), 0.0, state
@@ -304,13 +304,13 @@ def _fit(
             change = max(change, abs(math.log(scale / noise.scale)))
         noise = _Noise(excess, float(np.clip(1.0 - weight.mean(), *_OUTLIER_SHARE)), scale)
         state = moved
-        settled = max(size, change) < _SETTLED
+        converged = max(size, change) < _CONVERGED
     view = _Posterior(model, state, noise)
     covariance = np.zeros((len(state.x), len(state.x)))
     unsure = prior == "as-built" and model.tolerated.any()
     covariance[np.ix_(model.free, model.free)] = view.covariance_of_unsure_scale if unsure else view.covariance
     weight = model.by_sample(view.weight)
-    return Fit(state.x, covariance, noise.excess, noise.scale, weight, view.cost(), settled, rounds)
+    return Fit(state.x, covariance, noise.excess, noise.scale, weight, view.cost(), converged, rounds)
 
 
 def _first_noise(state: Linearised, prior: Prior) -> _Noise:

@@ -134,7 +134,7 @@ class Predictor:
             observations: n rows; their positions, if any, are not looked at.
             executor: threads among which many rows are divided; the result does not depend on it.
         """
-        if len(observations) <= _PIECE or self._effects.goes_by_order:
+        if len(observations) <= _PIECE or self._effects.depends_on_order:
             return self._predict(observations)
         rows = np.arange(len(observations))
         pieces = [observations.select(rows[first : first + _PIECE]) for first in range(0, len(rows), _PIECE)]

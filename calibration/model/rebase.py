@@ -55,7 +55,7 @@ def with_refitted_base(model: CalibratedModel, observations: Observations) -> Ca
     chain = Chain(model.rig, start.placements)
     free = np.arange(len(chain)) >= body
     context = EffectContext(chain, extended(model.values), observations)
-    model = replace(model, effects=tuple(effect.elsewhere(context) for effect in model.effects))
+    model = replace(model, effects=tuple(effect.at_new_setups(context) for effect in model.effects))
     additions = fitted_columns(model.effects, context)
     additions = additions.over(samples.average)
     moves = np.concatenate([free, np.zeros(len(additions), dtype=bool)])
@@ -76,10 +76,10 @@ def with_refitted_base(model: CalibratedModel, observations: Observations) -> Ca
         )
         fit = refine(chain, left, fit.x, free=moves, excess_variance=0.0, additions=additions)
     if model.residual is not None:
-        elsewhere = replace(model, placements=start.placements)
+        placed = replace(model, placements=start.placements)
         reason = _why_left_out(
-            replace(elsewhere, values=without.x[: len(chain)], residual=None, covariance=without.covariance),
-            replace(elsewhere, values=fit.x[: len(chain)], covariance=fit.covariance),
+            replace(placed, values=without.x[: len(chain)], residual=None, covariance=without.covariance),
+            replace(placed, values=fit.x[: len(chain)], covariance=fit.covariance),
             observations,
         )
         if reason:

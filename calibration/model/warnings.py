@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from calibration.effects.context import EffectContext
-from calibration.effects.fitted import left_out
+from calibration.effects.fitted import missing_inputs
 from calibration.effects.library import library
 from calibration.kinematics.torques import torque_columns
 from calibration.model.model import CalibratedModel, Outlier
@@ -47,7 +47,7 @@ def _warnings(model: CalibratedModel, observations: Observations) -> Iterator[st
         if not model.coverage.fixes.get(prism):
             yield f"prism {prism!r} was never measured in training; its offset is the nominal one"
     yield from _of_readings(model, observations)
-    yield from left_out(model.effects, context)
+    yield from missing_inputs(model.effects, context)
     yield from _of_torques(model, context)
     yield from _of_payload(model, context)
     yield from _of_residual(model, observations)
@@ -105,7 +105,7 @@ def _of_torques(model: CalibratedModel, context: EffectContext) -> Iterator[str]
 def _of_payload(model: CalibratedModel, context: EffectContext) -> Iterator[str]:
     """Warn of payloads that training did not have, in rows where a load in use is computed from them."""
     carried, used = [mass.kg for mass in model.rig.masses if mass.payload], sorted(_loads_used(model))
-    weighs = any(library()[effect.family].goes_with == "weights" for effect in model.effects)
+    weighs = any(library()[effect.family].load_kind == "weights" for effect in model.effects)
     if not carried or not (used or weighs):
         return
     measured = [np.isfinite(context.extra(f"{name}_Nm")) for name in used]
@@ -136,7 +136,7 @@ def _loads_by_name(model: CalibratedModel) -> set[str]:
     """Joints whose own load effects or the residual use."""
     learned = model.residual.signals if model.residual is not None else ()
     columns = zip(model.rig.joint_names, torque_columns(model.rig), strict=True)
-    used = {e.where for e in model.effects if library()[e.family].goes_with == "torque"}
+    used = {e.where for e in model.effects if library()[e.family].load_kind == "torque"}
     return used | {name for name, column in columns if column in learned}
 
 

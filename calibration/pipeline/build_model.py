@@ -52,7 +52,7 @@ def build_model(
     fit, samples = kinematics.fit, kinematics.samples
     original = is_original(observations)
     distinct = observations.select(original)
-    situation = EffectContext(kinematics.chain, fit.x, observations)
+    context = EffectContext(kinematics.chain, fit.x, observations)
     model = CalibratedModel(
         rig=rig,
         rig_text=rig_text,
@@ -70,9 +70,9 @@ def build_model(
         coverage=Coverage(
             {prism: int((distinct.prism == prism).sum()) for prism in rig.prism_names},
             {name: (float(v.min()), float(v.max())) for name, v in observations.joints.items()},
-            tuple(name for name in rig.joint_names if situation.is_torque_measured(name)),
+            tuple(name for name in rig.joint_names if context.is_torque_measured(name)),
             _payload(observations),
-            _loads(adopted, situation),
+            _loads(adopted, context),
         ),
         fitted_rows=tuple(row_digests(distinct)),
         provenance={
@@ -131,10 +131,10 @@ def _payload(observations: Observations) -> tuple[float, float] | None:
     return (float(measured.min()), float(measured.max())) if len(measured) else None
 
 
-def _loads(adopted: Adopted, situation: EffectContext) -> dict[str, tuple[float, float]]:
+def _loads(adopted: Adopted, context: EffectContext) -> dict[str, tuple[float, float]]:
     """The lowest and highest load on every joint that has an effect of it."""
-    loaded = {effect.where for effect in adopted.effects if library()[effect.family].goes_with == "torque"}
-    loads = {name: situation.torque(name) for name in sorted(loaded)}
+    loaded = {effect.where for effect in adopted.effects if library()[effect.family].load_kind == "torque"}
+    loads = {name: context.torque(name) for name in sorted(loaded)}
     known = {name: load[np.isfinite(load)] for name, load in loads.items()}
     return {name: (float(load.min()), float(load.max())) for name, load in known.items() if len(load)}
 

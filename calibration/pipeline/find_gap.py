@@ -115,9 +115,9 @@ def _answer(
         measured = holdout.position_mm
         held_out = rms(measured - predictor.geometric_mm(holdout)), rms(measured - predictor.effects_mm(holdout))
     candidates = tuple(_candidate(found.steps[-1], w) for w in found.alternatives)
-    situation = found.joint.situation
+    context = found.joint.context
     alternatives = [
-        [w.fitted(situation) for w in (alternative, *alternative.same_family)] for alternative in found.alternatives
+        [w.fitted(context) for w in (alternative, *alternative.same_family)] for alternative in found.alternatives
     ]
     proposed = propose_experiments(model, observations, alternatives, rng) if alternatives else ()
     return GapResult(
@@ -175,26 +175,26 @@ def _rounds(
 
 def _positions(joint: JointFit, observations: Observations) -> Floats:
     """Return (n, 3) positions of other rows by kinematics and effects of a fit."""
-    chain = joint.situation.chain
+    chain = joint.context.chain
     x = joint.fit.x[: len(chain)]
-    situation = replace(joint.situation, x=x, observations=observations)
+    context = replace(joint.context, x=x, observations=observations)
     applied = AppliedEffects(joint.effects, chain)
-    data, shift_mm = applied.columns(situation).apply(chain.bind(observations), applied.values)
+    data, shift_mm = applied.columns(context).apply(chain.bind(observations), applied.values)
     return chain.positions_mm(x, data) + shift_mm
 
 
 def _candidate(step: SelectionStep, scored: ScoredEffect) -> Candidate:
     """Return one of a step's candidates for outputs."""
-    situation, choice = step.fit.situation, scored.choice
+    context, choice = step.fit.context, scored.choice
     family = library()[choice.family]
-    coefficients = family.coefficients(situation, choice.where, choice.settings)
+    coefficients = family.coefficients(context, choice.where, choice.settings)
     named = any((choice.family, choice.where) == (c.family, c.where) for c in step.adopted)
     return Candidate(
         choice.family,
         choice.where,
         scored.posterior,
         scored.log_bayes_factor,
-        scored.fitted(situation).reported,
+        scored.fitted(context).reported,
         {c.name: (c.lower, c.upper) for c in coefficients} | dict(family.reported_limits()),
         "" if named else step.reasons.get(str(scored.candidate), "nothing asks for it beside the others"),
     )
@@ -207,7 +207,7 @@ def _noise(
 
     Scatter beyond the known noise is noise too, unless it depends on something.
     """
-    rig, fit = found.joint.situation.rig, found.joint.fit
+    rig, fit = found.joint.context.rig, found.joint.fit
     station = station_covariance(rig, observations.position_mm, observations.sigma_mm)
     readings = reading_covariance(rig, found.final.projection.joint_jacobian, samples.rates)
     known = sum(float(np.trace(c, axis1=1, axis2=2).mean()) for c in (station, readings))
@@ -230,9 +230,9 @@ def _warnings(
 ) -> Iterator[str]:
     found = rest.found
     yield from model.warnings
-    yield from rest.open_places()
+    yield from rest.ambiguous_places()
     if holdout is not None:
         yield from (f"in the held-out rows: {warning}" for warning in model_warnings(model, holdout))
     if found.formulas and found.adopted.effects:
         yield "what is left over depends on what no effect of the library explains"
-    yield from partly_known(found.joint.situation, families)
+    yield from partly_known(found.joint.context, families)

@@ -38,9 +38,9 @@ def training_warnings(model: CalibratedModel, observations: Observations, soluti
         solution: what it was made from.
     """
     yield from solution.warnings
-    situation = Predictor.of(model).context(observations)
-    yield from torque_unit_warnings(times_computed(situation))
-    rounding_mm, rounded = rounding(situation, model.effects_noise_mm)
+    context = Predictor.of(model).context(observations)
+    yield from torque_unit_warnings(times_computed(context))
+    rounding_mm, rounded = rounding(context, model.effects_noise_mm)
     if rounded:
         yield rounded
     yield from _of_fit(model, observations, solution, rounding_mm)
@@ -54,7 +54,7 @@ def training_warnings(model: CalibratedModel, observations: Observations, soluti
 def _of_fit(
     model: CalibratedModel, observations: Observations, solution: Solution, rounding_mm: float
 ) -> Iterator[str]:
-    if not solution.fit.settled:
+    if not solution.fit.converged:
         yield "the fit had not come to rest when it ended; treat the result with care"
     unexplained_mm = math.sqrt(max(0.0, 3.0 * model.excess_sigma_mm**2 - rounding_mm**2))
     if unexplained_mm > _BADLY * solution.tolerated_mm:

@@ -37,7 +37,7 @@ from calibration.run_settings import Run
 _SEEN = 1e-6  # singular value relative to the largest, for columns of equal length; redundant parameters are at 1e-16
 _ROUNDS = 100
 _HALVINGS = 12
-_SETTLED = 1e-4  # converged if a step changes the positions by less than this share of the error
+_CONVERGED = 1e-4  # converged if a step changes the positions by less than this share of the error
 
 
 @dataclass(frozen=True)
@@ -115,14 +115,14 @@ def skcm(rig: Rig, observations: Observations, run: Run) -> Adopted:
     solution = km(rig, observations, run.part(0.0, 0.7))
     chain, samples, nominal = solution.chain, solution.samples, solution.nominal
     run.progress(0.7, "iterating least squares with compliances")
-    situation = EffectContext(chain, nominal.x, observations)
+    context = EffectContext(chain, nominal.x, observations)
     joints = loaded_joints(rig, gravity_torques(chain, nominal.x, observations))
     choices = tuple(Choice("joint_compliance", rig.joint_names[joint], {}) for joint in joints)
-    compliances = _Compliances(samples, situation, choices)
+    compliances = _Compliances(samples, context, choices)
     fit, rounds = _iterated(chain, samples, nominal.x, compliances)
     p = len(chain)
     errors = np.sqrt(np.diag(fit.covariance))
-    effects = tuple(choice.fitted(situation, fit.x[[p + i]], errors[[p + i]]) for i, choice in enumerate(choices))
+    effects = tuple(choice.fitted(context, fit.x[[p + i]], errors[[p + i]]) for i, choice in enumerate(choices))
     joint = replace(
         solution,
         fit=fit,
@@ -157,13 +157,13 @@ class _Compliances:
     """The compliances to identify, none for kinematics alone; their torques depend on the kinematics."""
 
     samples: Samples
-    situation: EffectContext
+    context: EffectContext
     choices: tuple[Choice, ...] = ()
 
     def at(self, x: Floats) -> EffectColumns:
         """Return the columns of the samples at kinematic parameters x (p,)."""
-        situation = replace(self.situation, x=x)
-        found = joined([choice.columns(situation) for choice in self.choices], len(situation))
+        context = replace(self.context, x=x)
+        found = joined([choice.columns(context) for choice in self.choices], len(context))
         return found.over(self.samples.average)
 
 
@@ -179,14 +179,14 @@ def _iterated(chain: Chain, samples: Samples, start: Floats, compliances: _Compl
             f"{different} different fixes cannot determine {seen.shape[1]} parameters by least squares; "
             f"measure at least {seen.shape[1] // 3 + 1}"
         )
-    rounds, settled = 0, False
-    while not settled and rounds < _ROUNDS:
+    rounds, converged = 0, False
+    while not converged and rounds < _ROUNDS:
         rounds += 1
         if len(additions):
             state = _state(chain, samples, state.z, compliances.at(state.z[:p]))
         state, change = _step(chain, samples, state, seen)
-        settled = change <= _SETTLED
-    return _fit(chain, samples, state, seen, unseen, settled), rounds
+        converged = change <= _CONVERGED
+    return _fit(chain, samples, state, seen, unseen, converged), rounds
 
 
 def _state(chain: Chain, samples: Samples, z: Floats, additions: EffectColumns) -> _State:
@@ -223,7 +223,7 @@ def _step(chain: Chain, samples: Samples, state: _State, seen: Floats) -> tuple[
     return state, change
 
 
-def _fit(chain: Chain, samples: Samples, state: _State, seen: Floats, unseen: Floats, settled: bool) -> Fit:
+def _fit(chain: Chain, samples: Samples, state: _State, seen: Floats, unseen: Floats, converged: bool) -> Fit:
     """Return the fit: covariance of least squares in determined directions, of the prior in the others."""
     m = len(samples)
     variance = state.squares / (3 * m - seen.shape[1])
@@ -241,5 +241,5 @@ def _fit(chain: Chain, samples: Samples, state: _State, seen: Floats, unseen: Fl
         prior_scale=1.0,
         weight=np.ones(m),
         cost=1.5 * m * math.log(max(state.squares / (3 * m), 1e-300)),
-        settled=settled,
+        converged=converged,
     )

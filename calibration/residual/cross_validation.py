@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from calibration.observations import Floats
 from calibration.residual.features import Features
 from calibration.residual.folds import folds
-from calibration.residual.gaussian.process import Found, fit_gaussian_process
+from calibration.residual.gaussian.process import CurveTerms, fit_gaussian_process
 from calibration.residual.learners import with_estimate, with_out_of_fold_estimate
 from calibration.residual.rbf.rbfn import Shape, choose_shape, fit_shape
 from calibration.residual.trees.boosting import Settings, Tuned, cross_validate
@@ -65,7 +65,7 @@ class Shared:
     """
 
     shape: Shape | None = None
-    terms: Found | None = None
+    terms: CurveTerms | None = None
 
 
 class CrossValidation:
@@ -164,7 +164,7 @@ class CrossValidation:
 
     def _processes(self) -> list[Floats]:
         """Estimates of each fold's rows by a Gaussian process."""
-        found: list[tuple[Floats, Found | None]] = []
+        found: list[tuple[Floats, CurveTerms | None]] = []
         if self._has_many and self.shared.terms is None:
             found = self._map(_process_estimate, self._training[:1], self._held[:1])
             self.shared = replace(self.shared, terms=found[0][1])
@@ -204,8 +204,8 @@ def _network_estimate(training: Data, held: Features, shape: Shape, *, seed: int
 
 
 def _process_estimate(
-    training: Data, held: Features, *, seed: int, start: Found | None = None
-) -> tuple[Floats, Found | None]:
+    training: Data, held: Features, *, seed: int, start: CurveTerms | None = None
+) -> tuple[Floats, CurveTerms | None]:
     """Estimates of held-out rows, and the terms that they rest on."""
     process = fit_gaussian_process(training.features, training.target_mm, seed, start)
     return (np.zeros((len(held), 3)), None) if process is None else (process.predict(held), process.found)

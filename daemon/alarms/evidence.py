@@ -83,8 +83,8 @@ class Evidence:
         """True if captures are stored, and so decoded: until they are, every device looks silent and may not be."""
         return self.acquisition.error is None and not self.acquisition.is_write_hung
 
-    def standing(self, kind: EventKind, *ended_by: EventKind) -> list[EventStatus]:
-        """Events of a kind that their device has not taken back: by a later one of `ended_by`, or by code 0."""
+    def active_events(self, kind: EventKind, *ended_by: EventKind) -> list[EventStatus]:
+        """Return the active events of a kind: without code 0, and without a later event of `ended_by` of the device."""
         last = {(event.device, event.kind): event.number for event in self.acquisition.last_events}
         return [
             event
@@ -94,8 +94,8 @@ class Evidence:
             and all(last.get((event.device, end.value), -1) < event.number for end in ended_by)
         ]
 
-    def lately(self, kind: EventKind, within_s: float) -> list[EventStatus]:
-        """The last event of a kind of each device, where it is not older than that."""
+    def recent_events(self, kind: EventKind, within_s: float) -> list[EventStatus]:
+        """Return the last event of a kind of each device, if its age is at most `within_s`."""
         return [event for event in self.acquisition.last_events if event.kind == kind and event.age_s <= within_s]
 
     def link_of(self, device: str) -> LinkStatus | None:

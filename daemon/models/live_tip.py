@@ -217,7 +217,7 @@ def _travelled(model: CalibratedModel) -> Iterator[str]:
     from calibration.effects.library import library
 
     for effect in model.effects:
-        if library()[effect.family].goes_by_travel:
+        if library()[effect.family].depends_on_travel:
             yield (
                 f"{effect.family}@{effect.where} grows with the path that {effect.where} travels, which is not known "
                 f"since the training: calibrate again where that is much"

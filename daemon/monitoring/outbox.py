@@ -74,7 +74,7 @@ class Outbox:
         rows = table.waiting(target.name, now.utc_ns - STALE_NS, WAITING_MAX)
         self._waiting = [_Entry(_notice(row), row["id"]) for row in rows]
         # Alarms that were told, or wait to be, and are not over
-        self._standing = {notice.key: notice for notice in map(_notice, table.standing(target.name))}
+        self._uncleared = {notice.key: notice for notice in map(_notice, table.uncleared(target.name))}
         self._unlisted = 0
         self._unwritten: list[tuple[Notice, Stamp]] = []  # sent before the store took them
         self._sent_through: tuple[int, Stamp] | None = None  # what the store is still to know
@@ -97,27 +97,27 @@ class Outbox:
         """
         active = [_notice({**row, "event": "raised", "at": row["raised"]}) for row in alarms]
         for notice in active:
-            standing = self._standing.get(notice.key)
-            if standing is None or standing.raised != notice.raised:
+            uncleared = self._uncleared.get(notice.key)
+            if uncleared is None or uncleared.raised != notice.raised:
                 self.add(notice)
         keys = {notice.key for notice in active}
-        for key, standing in list(self._standing.items()):
+        for key, uncleared in list(self._uncleared.items()):
             if key not in keys:
-                self.add(replace(standing, event="cleared", at=now))
+                self.add(replace(uncleared, event="cleared", at=now))
 
     def add(self, notice: Notice) -> None:
         """Take a notice, if this target is to be told of it."""
-        standing = self._standing.get(notice.key)
+        uncleared = self._uncleared.get(notice.key)
         if notice.event == "raised":
             if notice.severity != "critical" and self._least == "critical":
                 return
-            if standing is not None and (standing.raised, standing.severity) == (notice.raised, notice.severity):
+            if uncleared is not None and (uncleared.raised, uncleared.severity) == (notice.raised, notice.severity):
                 return
-            self._standing[notice.key] = notice
+            self._uncleared[notice.key] = notice
         elif notice.event == "cleared":
-            if standing is None:
+            if uncleared is None:
                 return
-            del self._standing[notice.key]
+            del self._uncleared[notice.key]
         self._waiting.append(_Entry(notice))
         if len(self._waiting) > WAITING_MAX:
             del self._waiting[0]

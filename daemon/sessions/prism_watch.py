@@ -64,7 +64,7 @@ class PrismWatch:
         """Take a session's set-up into account: what was measured there before."""
         jumps = [jump for jump in preset_jumps(self._store, None) if jump.device in self._rig.joint_names]
         groups: dict[str, list[tuple[str, Mapping[str, float], Place]]] = {}
-        for row in self._table.standing(session.setup_id, jumps[-1].at if jumps else None):
+        for row in self._table.standstill_observations(session.setup_id, jumps[-1].at if jumps else None):
             place_mm = row["x_mm"], row["y_mm"], row["z_mm"]
             groups.setdefault(row["session_id"], []).append((row["prism"], json.loads(row["values_json"]), place_mm))
         earlier = [sightings_of(self._rig, rows) for rows in groups.values()]

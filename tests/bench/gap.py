@@ -46,7 +46,7 @@ def screening_seconds(source: RigSource, observations: Observations, seed: int) 
     seconds = []
     for _ in range(3):
         started = time.monotonic()
-        Screen(over, candidate_effects(over.situation, over, library()).candidates).score()
+        Screen(over, candidate_effects(over.context, over, library()).candidates).score()
         seconds.append(time.monotonic() - started)
     return min(seconds)
 

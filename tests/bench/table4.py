@@ -62,8 +62,8 @@ def _error_mm(solution: Solution, x: Floats, observations: Observations) -> Floa
 
 def _with_effects_mm(found: Adopted, observations: Observations) -> Floats:
     solution, names = found.solution, found.solution.chain.rig.joint_names
-    situation = EffectContext(solution.chain, solution.fit.x[: len(solution.chain)], observations)
-    change = fitted_columns(found.effects, situation).change(coefficient_values(found.effects), len(names))
+    context = EffectContext(solution.chain, solution.fit.x[: len(solution.chain)], observations)
+    change = fitted_columns(found.effects, context).change(coefficient_values(found.effects), len(names))
     return _error_mm(solution, solution.fit.x, corrected(observations, change, names))
 
 

@@ -1,4 +1,4 @@
-"""An angle encoder whose scale is off."""
+"""An angle encoder with a scale error."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from calibration.observations import Floats
 
 
 class AngleScale(JointFamily):
-    """True angle minus reading grows with the angle as read."""
+    """True angle minus reading is proportional to the reading."""
 
     name = "angle_scale"
     equation = "d_theta = scale * theta, theta as read"

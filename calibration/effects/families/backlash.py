@@ -14,17 +14,17 @@ _HALF_A_RAD_DEG = math.degrees(0.5)
 
 
 class Backlash(JointFamily):
-    """Play makes encoder or joint lag by half its width: the one that is driven through it.
+    """Play makes the side that is driven through it, encoder or joint, lag by half its width.
 
-    An encoder on the joint's own side lags behind the joint, which is further along its last motion: the width is
-    positive. Behind an encoder at the motor the joint lags, and the width is negative.
+    An encoder on the joint's side lags behind the joint, which is further along in the direction of its last motion:
+    the width is positive. With an encoder at the motor the joint lags, and the width is negative.
     """
 
     name = "backlash"
     equation = "d_theta = width / 2 * direction of the last motion (column <joint>_dir); width < 0: the joint lags"
-    source = "gear play; the approach from the other side shows it"
+    source = "gear play, visible when a pose is approached from the other side"
     confused_with = ("load_hysteresis", "gravity_flip_play")
-    revealed_by = "coming to the same pose from both sides"
+    revealed_by = "approaching the same pose from both sides"
     fixed = (Coefficient("width_rad", "rad", 1e-3, -5e-3, 5e-3),)
     column = "{where}_dir"
     kind = "revolute"

@@ -1,4 +1,4 @@
-"""A carrier that leans to the side where its boom weighs: jacks, tracks and the ground give way."""
+"""A carrier that leans under the weight of its boom: jacks, tracks and the ground are compliant."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ _LEAST_NM = 1e-6
 class BaseCompliance(PrismFamily):
     """The base tilts about each level axis in proportion to the moment of all weights about that axis.
 
-    Where the first joint is a lift, the mast below it may be what bends: the tilt then grows with a power of the lift's
-    height, 1 for a mast that turns at its foot, up to 3 for one that bends along all its length.
+    If the first joint is a lift, the mast below it may bend instead. The tilt then grows with a power of the lift's
+    height: 1 for a mast that turns at its foot, up to 3 for a mast that bends along its whole length.
     """
 
     name = "base_compliance"
@@ -33,7 +33,7 @@ class BaseCompliance(PrismFamily):
     source = "rigid body on linear springs; cantilever mast (Euler-Bernoulli)"
     confused_with = ("joint_compliance", "boom_droop", "base_step")
     revealed_by = "the boom far out to all sides, or a prism on the carrier while the boom swings"
-    goes_with = "weights"
+    load_kind = "weights"
     limit_sigma = 0.15
     place = "base"
     moves_machine = False
@@ -78,7 +78,7 @@ class BaseCompliance(PrismFamily):
 
 
 def _lift(rig: Rig) -> str | None:
-    """Return the first joint where it is prismatic, which lifts all the rest."""
+    """Return the first joint if it is prismatic, so that it lifts the whole machine."""
     first = rig.joints[0]
     return first.name if first.kind == "prismatic" else None
 

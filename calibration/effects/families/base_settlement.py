@@ -1,4 +1,4 @@
-"""A carrier that sinks into the ground, or whose jacks give way, little by little."""
+"""A carrier that gradually sinks into the ground, or whose jacks creep."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from calibration.effects.timing import DRIFT_SETTINGS, check_drift, drift_settin
 from calibration.observations import Floats
 
 _REST_S = "rest_s"
-_REST_SHARES = (1.0, 0.5, 0.25)  # of the time of the training
+_REST_SHARES = (1.0, 0.5, 0.25)  # candidate values of `rest_s`, as shares of the duration of the training data
 
 
 class BaseSettlement(SizedFamily):
-    """The base drifts as a rigid body from the first row of the training on, at a steady rate or ever slower.
+    """The base drifts as a rigid body from the first training row on, at a constant or a decreasing rate.
 
-    Ground that gives way under a load comes to rest: what is still to come falls to 1/e within `rest_s`. The rates are
-    then the mean ones over the time of the training.
+    Ground under a load comes to rest: the remaining settlement falls to 1/e within `rest_s`. The rates are then mean
+    rates over the duration of the training data.
     """
 
     name = "base_settlement"
-    equation = "tilts about the base's level x and y axes and rise = rates * (t - t_first), or as much, coming to rest"
+    equation = "tilts about the base's level x and y axes and rise = rates * (t - t_first), or an exponential approach"
     source = "rigid motion of the set-up, settlement under a load, creep of jacks"
     confused_with = ("base_step", "thermal_expansion", "payload_change")
     revealed_by = "the same few poses at the start, in the middle and at the end, or fixed control points"
@@ -64,7 +64,7 @@ def _shift_mm(context: EffectContext, settings: Settings) -> Floats:
     amount_s = elapsed_s(context, settings)
     if _REST_S in settings:
         span_s, rest_s = settings["span_s"], settings[_REST_S]
-        # Before the first row nothing is known of a drift that was faster then.
+        # Before the first row the drift would have been faster, which is not extrapolated.
         amount_s = span_s * np.expm1(-np.maximum(amount_s, 0.0) / rest_s) / np.expm1(-span_s / rest_s)
     return context.base_motion_mm(amount_s / 3600.0)
 

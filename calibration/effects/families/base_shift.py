@@ -1,4 +1,4 @@
-"""A carrier that moved over the ground at once: it slid, was pushed, or was set down a little further on."""
+"""A carrier that moved suddenly over the ground: it slid, was pushed, or was set down at a slightly different place."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ _HEADING = Coefficient("heading_rad", "rad", 1e-3, -10e-3, 10e-3)
 
 
 class BaseShift(SizedStepFamily):
-    """The base stands elsewhere on the ground, and points elsewhere, in all rows after one instant.
+    """The base has a different position on the ground and a different heading in all rows after one instant.
 
-    Tilts and the rise are `base_step`'s: a carrier that slips off a jack does both. A pedestal that turns in its foot
-    turns on the spot, about the upright axis through the base's origin: a form with the heading alone.
+    Tilts and rise belong to `base_step`; a carrier that slips off a jack shows both effects. A pedestal that turns in
+    its foot turns about the upright axis through the base's origin: a variant with the heading alone.
     """
 
     name = "base_shift"
@@ -60,7 +60,7 @@ class BaseShift(SizedStepFamily):
     def reported(
         self, settings: Settings, coefficients: tuple[FittedCoefficient, ...]
     ) -> tuple[FittedCoefficient, ...]:
-        """Return shifts, heading and instant; shifts of a carrier that turns on the spot are zero."""
+        """Return shifts, heading and instant; the shifts of a carrier that turned on the spot are zero."""
         listed = super().reported(settings, coefficients)
         if _ON_THE_SPOT in settings:
             listed = (*(FittedCoefficient(c.name, c.unit, 0.0, 0.0, c.sigma) for c in self.fixed[:2]), *listed)

@@ -1,4 +1,4 @@
-"""A carrier that shifted at once: a jack slipped, something struck it, it was set down anew."""
+"""A carrier that tilted or rose suddenly: a jack slipped, something struck it, or it was set down again."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from calibration.observations import Floats
 
 
 class BaseStep(SizedStepFamily):
-    """The base stands otherwise, as a rigid body, in all rows after one instant."""
+    """The base has different tilts and a different height, as a rigid body, in all rows after one instant."""
 
     name = "base_step"
     equation = "tilts about the base's level x and y axes and rise, for t > time_s"
     source = "rigid motion of the set-up at one instant: a jack that slips, a knock"
     confused_with = ("base_settlement", "payload_change", "transducer_index_jump")
-    revealed_by = "fixed control points, or one pose again and again all through the session"
+    revealed_by = "fixed control points, or one pose repeated throughout the session"
     fixed = (
         Coefficient("tilt_x_rad", "rad", 1e-3, -5e-3, 5e-3),
         Coefficient("tilt_y_rad", "rad", 1e-3, -5e-3, 5e-3),

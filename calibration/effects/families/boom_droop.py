@@ -1,4 +1,4 @@
-"""A boom that bends under what hangs on it."""
+"""A boom that bends under its load."""
 
 from __future__ import annotations
 
@@ -10,36 +10,37 @@ import numpy as np
 from calibration.effects.base import Coefficient, Settings
 from calibration.effects.boom import Boom, BoomFamily, boom_in
 from calibration.effects.context import EffectContext
-from calibration.effects.load_shapes import LoadShapes, OfUncertainLoad, shapes_by_design
+from calibration.effects.load_shapes import LoadShapes, UncertainLoadFamily, shapes_by_design
 from calibration.errors import ModelError
 from calibration.kinematics.torques import MASS_SIGMA
 from calibration.observations import Floats
 
 _FLEXIBILITY = "flexibility_per_Nm2"
 _UNIT = "1/(N m^2)"
-_SIGMA_MM = 20.0  # of the tip at full reach
+_SIGMA_MM = 20.0  # plausible droop of the tip at full reach
 _BOUND_MM = 300.0
-_OWN_SIGMA = 1.0 / math.sqrt(3.0)  # of the boom's own weight: nobody says how it is spread, +-100 %
-_AHEAD_MM = 3000.0  # of the tip: a second place that shows the slope beside the shift
+_OWN_SIGMA = 1.0 / math.sqrt(3.0)  # of the effect of the boom's own weight, whose distribution is unknown: +-100 %
+_AHEAD_MM = 3000.0  # distance ahead of the tip of a second point, which also makes the slope visible
 _MOST_PARTS = 100
 
 
-class BoomDroop(OfUncertainLoad, BoomFamily):
+class BoomDroop(UncertainLoadFamily, BoomFamily):
     """An Euler-Bernoulli cantilever from the boom's root to its tip, longer as it extends.
 
-    The tip carries the weights F of all that is beyond, with their moment M about it; weights W that are fixed to the
-    root section are spread evenly over the length. All that is beyond the tip moves with it as one.
+    The tip carries the weights F of all parts beyond it, with their moment M about the tip. Weights W that are fixed to
+    the root section are spread evenly over the length. All parts beyond the tip move with it as a rigid body.
 
-    Weights and centres of gravity are known to +-15 % only, and how the boom's own weight is spread not at all. What
-    that leaves open of the droop's course over the work volume are the shapes of `load_shapes`, which the variants with
-    `about_per_Nm2` add; what makes all of it larger or smaller is no shape and counts in the standard error.
+    Weights and centres of gravity are known to +-15 % only, and the distribution of the boom's own weight is unknown.
+    The resulting uncertainty of the droop's course over the work volume is described by the shapes of `load_shapes`,
+    which the variants with `about_per_Nm2` add. A common factor on the whole droop is not a shape; its uncertainty is
+    part of the standard error.
     """
 
     name = "boom_droop"
     equation = "shift = (F L^3/3 + M L^2/2 + W L^3/8) / EI, slope = (F L^2/2 + M L + W L^2/6) / EI"
     source = "Euler-Bernoulli beam theory: cantilever with a load and a moment at its end"
     confused_with = ("joint_compliance", "transducer_quadratic", "pad_play")
-    revealed_by = "the same attitude of the boom drawn in and run out, once with a load and once without"
+    revealed_by = "the same attitude of the boom retracted and extended, once with a load and once without"
 
     def variants(self, context: EffectContext, where: str) -> tuple[Settings, ...]:
         boom = boom_in(context)
@@ -81,29 +82,30 @@ class BoomDroop(OfUncertainLoad, BoomFamily):
 
 
 def load_factors(boom: Boom, names: Sequence[str]) -> Floats:
-    """Return the factors on each weight for every coefficient.
+    """Return the factors on each point weight for every coefficient.
 
     Args:
         boom: the boom.
-        names: (k,) of the coefficients.
+        names: names of the k coefficients.
 
     Returns:
-        (4 * points, k): at the tip, for its moment, for its centre's moment, and along the boom.
+        (4 * points, k) factors of four load cases: force at the tip, moment about the tip, moment of the centre of
+        gravity, and weight along the boom.
 
     Raises:
-        ModelError: the coefficients are of other shapes of the load, made by another version of this program.
+        ModelError: the coefficients belong to different load shapes, of a different version of this program.
     """
     loads, shaped = _whole(boom), names[1:]
     if not shaped:
         return loads
     shapes = _shapes(boom.context)
     if len(shapes) != len(shaped):
-        raise ModelError(f"the model has {len(shaped)} shapes of a droop that has {len(shapes)}; calibrate again")
+        raise ModelError(f"the model has {len(shaped)} shapes of a droop, its rig {len(shapes)}; calibrate again")
     return np.hstack([loads, (_parts(boom) - loads * shapes.share) @ shapes.mixing])
 
 
 def _greatest_mm(context: EffectContext) -> float:
-    """Return the greatest droop of the tip in the work volume, mm per unit of flexibility; 0 where nothing bends it."""
+    """Return the largest droop of the tip in the work volume, mm per unit of flexibility; 0 without a load."""
     boom = boom_in(context.work_volume)
     if boom is None or not context.rig.masses:
         return 0.0
@@ -112,14 +114,14 @@ def _greatest_mm(context: EffectContext) -> float:
 
 
 def _shapes(context: EffectContext) -> LoadShapes:
-    """Return the shapes by which uncertain weights change the droop over the poses."""
+    """Return the shapes of the droop's uncertainty due to uncertain weights."""
     return shapes_by_design(context, BoomDroop.name, _in_volume)
 
 
 def _in_volume(volume: EffectContext) -> tuple[Floats, Floats]:
-    """Return how far the tip and a place ahead of it sink per unit of flexibility, mm: (m,), by parts (m, parts)."""
+    """Return the sag of the tip and a point ahead of it per unit of flexibility, mm: total (m,), parts (m, parts)."""
     boom = boom_in(volume)
-    assert boom is not None  # who asks for its shapes has one
+    assert boom is not None  # only called for rigs with a boom
     loads = np.hstack([_whole(boom), _parts(boom)])
     sunk = [
         np.einsum("ni,nik->nk", boom.down, _moved_mm(boom, ahead_mm * boom.axis, loads))
@@ -130,13 +132,13 @@ def _in_volume(volume: EffectContext) -> tuple[Floats, Floats]:
 
 
 def _whole(boom: Boom) -> Floats:
-    """Return (4 * points, 1) factors on each weight: at the tip, its moment, its centre's moment, along the boom."""
+    """Return the (4 * points, 1) factors of the nominal weights; load cases as in `load_factors`."""
     none = np.zeros(len(boom.hanging))
     return np.concatenate([boom.hanging, boom.hanging, none, boom.own])[:, None]
 
 
 def _parts(boom: Boom) -> Floats:
-    """Return (4 * points, parts) the same factors for one sigma of every uncertain part of the weights."""
+    """Return the (4 * points, parts) factors for a change by one sigma of every uncertain part of the weights."""
     mass_of = boom.context.loads.point_mass
     none = np.zeros(len(mass_of))
     parts = []
@@ -154,8 +156,9 @@ def _parts(boom: Boom) -> Floats:
 def _moved_mm(boom: Boom, arm_mm: Floats, loads: Floats) -> Floats:
     """Return the displacement (n, 3, k) in the base frame at `arm_mm` (n, 3) from the tip, mm per unit of 1 / EI.
 
-    With the boom's axis e, gravity's direction g and a point at s from the tip: a weight w at the tip bends by the part
-    of w g across e and turns about e x g; one at r from it adds the moment m = w r x g, less its part along e.
+    Notation: e is the boom's axis, g the direction of gravity, s the vector from the tip to the point. A weight w at
+    the tip bends the boom by the component of w g across e and turns it about e x g. A weight at r from the tip adds
+    the moment m = w r x g without its component along e.
     """
     places_mm, newton = boom.weights
     tip, moment, centre, own = np.split(loads, 4)
@@ -169,7 +172,7 @@ def _moved_mm(boom: Boom, arm_mm: Floats, loads: Floats) -> Floats:
     across, turning = g - (e * g).sum(axis=1)[:, None] * e, boom.lowered(s)
     at_tip = across * length**3 / 3.0 + turning * length**2 / 2.0
     along = across * length**3 / 8.0 + turning * length**2 / 6.0
-    # The moment's shift is m x e L^2 / 2 and its slope (m - (m e) e) L, so that s moves by
+    # The moment shifts the tip by m x e L^2 / 2 and turns it by (m - (m e) e) L, so that the point at s moves by
     # m x (e L^2 / 2 + s L) - (m e) e x s L, with m = -g x (w r).
     twist = _crossing(e) @ (s * length)[:, :, None]
     by_moment = _crossing(e * length**2 / 2.0 + s * length) + twist * e[:, None, :]
@@ -179,7 +182,7 @@ def _moved_mm(boom: Boom, arm_mm: Floats, loads: Floats) -> Floats:
 
 
 def _crossing(v: Floats) -> Floats:
-    """Return the matrices (n, 3, 3) of the cross products v x with vectors (n, 3)."""
+    """Return the cross product matrices (n, 3, 3) of vectors (n, 3)."""
     out = np.zeros((len(v), 3, 3))
     out[:, 1, 0], out[:, 2, 1], out[:, 0, 2] = v[:, 2], v[:, 0], v[:, 1]
     return out - out.transpose(0, 2, 1)

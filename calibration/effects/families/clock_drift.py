@@ -1,4 +1,4 @@
-"""Two clocks that run apart: the station's and that of the joints."""
+"""Drift between the station's clock and the clock of the joint readings."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from calibration.observations import Floats
 
 
 class ClockDrift(SizedFamily):
-    """A latency that grows steadily from the first row of the training on; nothing where the boom stands."""
+    """A latency that grows linearly from the first training row on; no effect while the boom stands still."""
 
     name = "clock_drift"
     equation = "shift = -J_q (dq/dt) * ppm * 1e-6 * (t - t_first)"
-    source = "frequency error of quartz clocks that nothing disciplines: some ppm, 50 at the worst"
+    source = "frequency error of free-running quartz clocks: a few ppm, at most 50"
     confused_with = ("latency",)
     revealed_by = "fixes of a moving boom at the start and at the end of a long session"
     fixed = (Coefficient("ppm", "ppm", 5.0, -50.0, 50.0),)

@@ -1,4 +1,4 @@
-"""A cylinder whose oil gives way to pressure."""
+"""A cylinder whose oil is compressed by the pressure."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from calibration.observations import Floats
 
 
 class CylinderCompression(JointFamily):
-    """True length minus reading goes with the pressure in the joint's own cylinder, column `<joint>_bar`."""
+    """True length minus reading is proportional to the pressure in the joint's own cylinder, column `<joint>_bar`."""
 
     name = "cylinder_compression"
     equation = "d_s = k * pressure (column <joint>_bar)"
     source = "bulk modulus of hydraulic oil, about 14 000 bar, and the stretch of barrel and rod"
     confused_with = ("joint_compliance", "boom_droop", "transducer_scale")
-    revealed_by = "the same length under another pressure: against a stop, or with a payload and without"
+    revealed_by = "the same length at different pressures: against a stop, or with a payload and without"
     fixed = (Coefficient("mm_per_bar", "mm/bar", 0.01, -0.1, 0.1),)
     column = "{where}_bar"
     kind = "prismatic"

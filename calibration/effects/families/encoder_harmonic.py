@@ -1,4 +1,4 @@
-"""An encoder that sits off its axis, or whose disc is oval."""
+"""An encoder that is eccentric, or whose disc is oval."""
 
 from __future__ import annotations
 
@@ -14,18 +14,19 @@ _HALF_A_TURN_DEG = 180.0
 
 
 class EncoderHarmonic(JointFamily):
-    """An error that repeats k times a turn: k = 1 for eccentricity, 2 for an oval or tilted disc; or both at once.
+    """An error that repeats k times per turn: k = 1 for eccentricity, 2 for an oval or tilted disc; or both at once.
 
-    Over less than half a turn both together bend like any curve, a straight line too: they are no form of it there.
+    Over less than half a turn the two together fit almost any curve, even a straight line. That variant is not used
+    there.
     """
 
     name = "encoder_harmonic"
     equation = (
-        "d_theta = cosk cos(k theta) + sink sin(k theta), k = 1 or 2; for k = 1 also with the same of 2k beside it"
+        "d_theta = cosk cos(k theta) + sink sin(k theta), k = 1 or 2; for k = 1 optionally plus the same terms of 2k"
     )
     source = "eccentricity of a rotary encoder's disc: e / r = error in rad, once a turn"
     confused_with = ("angle_scale", "joint_error_map", "joint_compliance")
-    revealed_by = "the joint alone over its whole range, in even steps"
+    revealed_by = "the joint alone over its whole range, in equal steps"
     kind = "revolute"
 
     def variants(self, context: EffectContext, where: str) -> tuple[Settings, ...]:
@@ -39,7 +40,7 @@ class EncoderHarmonic(JointFamily):
     def names(self, settings: Settings) -> tuple[str, ...]:
         if settings not in (*_SINGLE, _BOTH):
             raise ValueError(
-                "the settings are k, 1 or 2, and where k is 1 doubled = 1, if twice a turn is there as well"
+                "the settings are k, 1 or 2, and for k = 1 optionally doubled = 1, if the terms of 2k are included"
             )
         return ("cosk_rad", "sink_rad", *(("cos2k_rad", "sin2k_rad") if "doubled" in settings else ()))
 

@@ -1,4 +1,4 @@
-"""Play that rests on the side that gravity pushes to."""
+"""Play of a joint that gravity pushes to one side."""
 
 from __future__ import annotations
 
@@ -18,30 +18,30 @@ from calibration.observations import Floats
 _SIGMA_RAD = 1e-3
 _BOUND_RAD = 5e-3
 _SPREAD, _OTHER = "spread", "other_Nm"
-_LEAST_LOAD = 2e-3  # of the largest: what a machine leans, and its posture, are known to about 0.1 deg
+_LEAST_LOAD = 2e-3  # uncertainty as a share of the largest load: inclination and posture are known to about 0.1 deg
 _TERMS = 2
-_GRID, _STEP = np.linspace(-2.0, 2.0, 9).tolist(), 0.2  # of the largest shape, and what is open between its points
-_NEAR = 3.0  # times what is open of it: a load this far from zero has its sign for certain
-_MOST_SHAPES = 3  # of a load that finer forms take; more hardly move its zero
-_CLOUD, _FINER = 128, 0.15  # finer forms, and what is open between them
+_GRID, _STEP = np.linspace(-2.0, 2.0, 9).tolist(), 0.2  # grid of the largest shape, and sigma between its points
+_NEAR = 3.0  # a load further from zero than this number of sigmas has a certain sign
+_MOST_SHAPES = 3  # shapes of a load that finer variants vary; more hardly move its zero
+_CLOUD, _FINER = 128, 0.15  # number of finer variants, and sigma between them
 
 
 class GravityFlipPlay(TorqueFamily):
-    """The joint gives way by half the play in the direction of its load, and flips over where the load does.
+    """The joint moves by half the play in the direction of its load, and to the other side where the load changes sign.
 
-    The load is known from the rig file's masses, to +-15 %, so where it changes its sign is known to some tenths of a
-    degree, and poses are many there: a face is drilled with the feed level. So variants have the masses at one of
-    several places, with what is open about it. With t the load over what is open of it, the expected sign is
-    2 Phi(t) - 1; and where one number moves the zero of all poses alike, the sign goes about this as a Brownian bridge
-    in u = Phi(t), whose Karhunen-Loeve terms are sqrt(8) / (k pi) sin(k pi u), independent of each other (Shorack and
-    Wellner 1986, chapter 5). The first of them have coefficients of their own.
+    The load follows from the rig file's masses, to +-15 %. The angle at which it changes sign is therefore uncertain by
+    some tenths of a degree, and many poses are near it, as a face is drilled with the feed level. Variants therefore
+    place the masses at one of several values, with the remaining uncertainty around it. With t the load divided by its
+    uncertainty, the expected sign is 2 Phi(t) - 1. Where a single number moves the zero of all poses together, the
+    deviation of the sign from this is a Brownian bridge in u = Phi(t), with the independent Karhunen-Loeve terms
+    sqrt(8) / (k pi) sin(k pi u) (Shorack and Wellner 1986, chapter 5). The first terms have coefficients.
     """
 
     name = "gravity_flip_play"
     equation = "d_theta = width / 2 * sign(torque)"
-    source = "clearance of pins and gears under a load that changes sides"
+    source = "clearance of pins and gears under a load that changes sign"
     confused_with = ("joint_compliance", "backlash", "encoder_harmonic")
-    revealed_by = "poses close to either side of where the joint's load changes its sign"
+    revealed_by = "poses close to the sign change of the joint's load, on both sides"
 
     def variants(self, context: EffectContext, where: str) -> tuple[Settings, ...]:
         largest = context.greatest_torque(where)
@@ -58,7 +58,7 @@ class GravityFlipPlay(TorqueFamily):
         return ({}, *({**common, _shape(0): at} for at in _GRID))
 
     def refined(self, context: EffectContext, where: str, settings: Settings) -> tuple[Settings, ...]:
-        """Return forms with masses drawn from their prior: a low-discrepancy sequence, made normal."""
+        """Return variants with masses from their normal prior, by a transformed low-discrepancy sequence."""
         variants = self.variants(context, where)
         if len(variants) < 2:
             return ()
@@ -67,15 +67,15 @@ class GravityFlipPlay(TorqueFamily):
         common = {**variants[1], _SPREAD: _FINER}
         return (settings, *({**common, **{_shape(k): p for k, p in enumerate(at)}} for at in cloud.tolist()))
 
-    def settled(self, forms: Sequence[Settings], probability: Floats) -> Settings:
-        """Return the mean of the masses; the first form where that is more likely than all others together."""
+    def posterior_settings(self, forms: Sequence[Settings], probability: Floats) -> Settings:
+        """Return the posterior mean of the masses; the first variant if its probability is above 0.5."""
         if probability[0] > 0.5:
             return forms[0]
         finer, weight = forms[1:], probability[1:] / probability[1:].sum()
         return {name: float(weight @ [form[name] for form in finer]) for name in finer[0]}
 
     def odds(self, settings: Settings) -> float:
-        """Return the prior odds of the masses; those of the rig file are in the middle of the grid as well."""
+        """Return the prior odds of the masses; the middle of the grid repeats those of the rig file."""
         return math.exp(-0.5 * settings.get(_shape(0), 0.0) ** 2)
 
     def names(self, settings: Settings) -> tuple[str, ...]:
@@ -84,7 +84,9 @@ class GravityFlipPlay(TorqueFamily):
         shapes = len(settings) - 2
         expected = {_SPREAD, _OTHER, *map(_shape, range(shapes))}
         if set(settings) != expected or not 0.0 < settings[_SPREAD] <= 1.0 or settings[_OTHER] <= 0.0:
-            raise ValueError(f"the settings are {_SPREAD}, to 1, {_OTHER}, and {_shape(0)} ... for the load's shapes")
+            raise ValueError(
+                f"the settings are {_SPREAD}, at most 1, {_OTHER}, and {_shape(0)} ... for the load's shapes"
+            )
         return ("width_rad", *(f"flip{number}_rad" for number in range(1, _TERMS + 1)))
 
     def coefficients(self, context: EffectContext, where: str, settings: Settings) -> tuple[Coefficient, ...]:
@@ -124,24 +126,31 @@ class GravityFlipPlay(TorqueFamily):
 
 
 def places_and_spreads(settings: Settings, shapes: int) -> tuple[list[float], Floats]:
-    """Return where the first shapes of the load are, in sigmas, and (shapes,) what is open of each.
+    """Return the values of the first shapes of the load, in sigmas, and the remaining sigma of every shape.
+
+    Args:
+        settings: the variant.
+        shapes: number of shapes of the load.
+
+    Returns:
+        Values of the shapes that the settings contain; (shapes,) sigmas.
 
     Raises:
         ModelError: the load has fewer shapes than the settings.
     """
     at = [settings[_shape(number)] for number in range(len(settings) - 2)]
     if len(at) > shapes:
-        raise ModelError(f"the model has {len(at)} shapes of a load that has {shapes}; calibrate again")
+        raise ModelError(f"the model has {len(at)} shapes of a load, its rig {shapes}; calibrate again")
     return at, np.where(np.arange(shapes) < len(at), settings[_SPREAD], 1.0)
 
 
 def other_newton_m(settings: Settings) -> float:
-    """Return what is open of the load beside its shapes, N m."""
+    """Return the uncertainty of the load in addition to its shapes, N m."""
     return settings[_OTHER]
 
 
 def _shape(number: int) -> str:
-    """Return the name of a setting: by how many sigmas a shape of the load differs from the rig file's masses."""
+    """Return the setting's name for a shape's deviation from the rig file's masses, in sigmas."""
     return f"shape{number + 1}"
 
 

@@ -1,4 +1,4 @@
-"""A joint that gives way under its load, in proportion to it or along a curve."""
+"""A joint that deflects under its load, linearly or along a curve."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from calibration.effects.base import Coefficient, Settings
 from calibration.effects.context import EffectContext
 from calibration.effects.load_shapes import (
     UNIT,
-    OfUncertainLoad,
     TorqueFamily,
+    UncertainLoadFamily,
     gravity_shapes,
     load_columns,
     load_variants,
@@ -29,33 +29,34 @@ _BENDS_RAD = (0.15e-3, 0.5e-3, 1.5e-3)
 _BEND_BOUND_RAD = 50e-3
 _KNOT_POWERS = (1.0, 2.0)
 _SYMMETRIC, _ASYMMETRIC = {"torque_Nm", "knot_power", "bend_rad"}, {"low_Nm", "high_Nm", "bend_rad"}
-_LOAD_SIGMA = "load_sigma"  # a curve of a computed load holds it, as the straight variants do
-_ASYMMETRIC_ODDS = 0.01  # beside the symmetric
-_CURVED_ODDS = 0.2  # of all curves of a computed load beside the straight variants
+_LOAD_SIGMA = "load_sigma"  # a setting of all variants with a computed load, linear or curved
+_ASYMMETRIC_ODDS = 0.01  # relative to the symmetric curves
+_CURVED_ODDS = 0.2  # of all curves of a computed load together, relative to the linear variants
 _UNKNOWN_LOADS = 101
 
 
-class JointCompliance(OfUncertainLoad, TorqueFamily):
-    """Deflection by the gravity torque; its stiffness is constant, or changes smoothly with the torque.
+class JointCompliance(UncertainLoadFamily, TorqueFamily):
+    """Deflection by the gravity torque, with a stiffness that is constant or changes smoothly with the torque.
 
-    Gears stiffen as they wind up: harmonic drives in three steps, bearings and teeth with a soft zone about zero. The
-    curved variants add a natural cubic spline of s, the torque over the largest one of the training data. Its further
-    coefficients are the changes of slope about its knots, in rad per s, independent of each other beforehand: the
-    prior of a smoothing spline (Wahba 1978), of size `bend_rad`. Beyond the last knot it goes on straight.
+    Gears stiffen as they wind up: harmonic drives in three steps, bearings and teeth with a soft zone around zero. The
+    curved variants add a natural cubic spline of s, the torque divided by the largest torque of the training data. Its
+    coefficients are the changes of slope at the knots, in rad per unit of s. They are independent a priori with size
+    `bend_rad`: the prior of a smoothing spline (Wahba 1978). Beyond the last knot the spline continues linearly.
 
-    Where the load is computed, the straight variants also have what uncertain masses leave open about its course, and a
-    curve is the last resort: what masses and other joints leave over often looks like one. A measured load says more.
+    If the load is computed, the linear variants also include the uncertainty of the load's course due to uncertain
+    masses, and a curve has low prior odds, as residuals of masses and of other joints often resemble one. A measured
+    load is more conclusive.
 
-    A symmetric curve gives way to both sides alike, g(-s) = -g(s): what is learned on one side holds on the other. Its
-    knots are spread evenly (`knot_power` 1) or towards zero (2). An asymmetric curve has s from the lowest to the
-    highest torque, and even knots; gears are rarely so.
+    A symmetric curve is odd, g(-s) = -g(s), so that data of one side determine the other. Its knots are spaced evenly
+    (`knot_power` 1) or denser towards zero (2). An asymmetric curve has s from the lowest to the highest torque and
+    evenly spaced knots; gears rarely behave like this.
     """
 
     name = "joint_compliance"
-    equation = "d_theta = compliance * torque [+ g(s), g a spline, s the torque over the largest]"
+    equation = "d_theta = compliance * torque [+ g(s), g a spline, s = torque / largest torque]"
     source = "ICIC 2020, Eqs. 16, 17; curve: stiffness of harmonic drives (Tuttle and Seering 1996)"
     confused_with = ("boom_droop", "encoder_harmonic", "payload_change")
-    revealed_by = "the same readings of the joint under little and great load: near and far, with a payload and without"
+    revealed_by = "the same reading of the joint at low and high load: short and long reach, with and without a payload"
 
     def variants(self, context: EffectContext, where: str) -> tuple[Settings, ...]:
         torque = context.greatest_torque(where)
@@ -98,7 +99,7 @@ class JointCompliance(OfUncertainLoad, TorqueFamily):
         torque = context.greatest_torque(where)
         linear, *bends = self.names(settings)
         most = _BOUND_RAD / torque
-        # A drive may report the torque that holds the load in place of the load: the same curve, the other way round.
+        # A drive may report the holding torque instead of the load, with the opposite sign.
         least = -most if context.is_torque_measured(where) else 0.0
         own = Coefficient(linear, UNIT, _SIGMA_RAD / torque, least, most)
         if "bend_rad" not in settings:
@@ -108,8 +109,8 @@ class JointCompliance(OfUncertainLoad, TorqueFamily):
             *(Coefficient(name, "rad", settings["bend_rad"], -_BEND_BOUND_RAD, _BEND_BOUND_RAD) for name in bends),
         )
 
-    def strained(self, settings: Settings, values: Floats, standard_errors: Floats) -> bool:
-        return "bend_rad" not in settings and super().strained(settings, values, standard_errors)
+    def has_implausible_shape(self, settings: Settings, values: Floats, standard_errors: Floats) -> bool:
+        return "bend_rad" not in settings and super().has_implausible_shape(settings, values, standard_errors)
 
     def columns(self, context: EffectContext, where: str, settings: Settings) -> Floats:
         load = context.torque(where)
@@ -123,12 +124,12 @@ class JointCompliance(OfUncertainLoad, TorqueFamily):
         return np.degrees(columns)
 
     def unknown_variance(self, values: Floats, plausible: Floats, settings: Settings) -> float:
-        """Return the mean square for a link that may point anywhere: its load is a sine between those of training."""
-        most = _SIGMA_RAD / float(plausible[0])  # as `coefficients` has it
+        """Return the mean square for a link in any direction: its load varies as a sine within the training range."""
+        most = _SIGMA_RAD / float(plausible[0])  # inverse of `coefficients`
         low, high = (settings["low_Nm"], settings["high_Nm"]) if "low_Nm" in settings else (-most, most)
         turns = np.sin(np.linspace(-0.5, 0.5, _UNKNOWN_LOADS) * np.pi)
         torque = 0.5 * (low + high) + 0.5 * (high - low) * turns
-        # What shapes a straight one is small beside it.
+        # The shapes of a linear variant are small compared with the compliance itself.
         change = _curved(torque, settings) @ values if "bend_rad" in settings else torque * values[0]
         return float(np.mean(np.degrees(change) ** 2))
 
@@ -141,7 +142,7 @@ def _curved(torque: Floats, settings: Settings) -> Floats:
 def _curves(torque: Floats, settings: Settings) -> Floats:
     """Return the splines (n, knots), rad per unit change of slope at each knot.
 
-    The straight line that fits each best over the whole range is taken from it, so that the compliance is the mean one.
+    The best fitting straight line over the whole range is subtracted, so that the compliance is the mean one.
     """
     if "torque_Nm" in settings:
         return _straightened(torque / settings["torque_Nm"], settings["knot_power"])
@@ -150,7 +151,7 @@ def _curves(torque: Floats, settings: Settings) -> Floats:
 
 
 def _straightened(s: Floats, knot_power: float | None) -> Floats:
-    """Return the splines (n, knots) at loads between -1 and 1, symmetric ones where the knots have a power."""
+    """Return the splines (n, knots) at loads between -1 and 1; symmetric if there is a knot power."""
     knots, line = shape_of_curve(knot_power)
     out = np.empty((len(s), _KNOTS))
     _bent(np.ascontiguousarray(s), knots, line, knot_power is not None, out)
@@ -159,7 +160,7 @@ def _straightened(s: Floats, knot_power: float | None) -> Floats:
 
 @cache
 def shape_of_curve(knot_power: float | None) -> tuple[Floats, Floats]:
-    """Return the knots and (2, inner knots) the straight lines that fit the splines best between -1 and 1."""
+    """Return the knots, and the best fitting straight lines (2, inner knots) of the splines between -1 and 1."""
     spread = np.linspace(0.0, 1.0, _KNOTS + 2)
     knots = 2.0 * spread - 1.0 if knot_power is None else spread**knot_power
     whole = np.linspace(-1.0, 1.0, 201)
@@ -170,9 +171,9 @@ def shape_of_curve(knot_power: float | None) -> tuple[Floats, Floats]:
 
 @compiled
 def _bent(s: Floats, knots: Floats, line: Floats, symmetric: bool, out: Floats) -> None:
-    """Fill `out` (n, inner knots) with cubic splines whose slope changes by 1 about one of the knots, less `line`.
+    """Fill `out` (n, inner knots) with cubic splines whose slope changes by 1 around one knot, minus `line`.
 
-    The second derivative is a triangle from the knot before to the knot behind.
+    The second derivative is a triangle from the preceding knot to the following one.
     """
     for n in range(len(s)):
         for k in range(out.shape[1]):

@@ -1,4 +1,4 @@
-"""A joint whose error is a curve of its own angle: what a gear, an encoder's code disc and a bearing make together."""
+"""A joint whose error is a curve of its own angle: the sum of gear, encoder disc and bearing errors."""
 
 from __future__ import annotations
 
@@ -14,36 +14,35 @@ from calibration.numerics.jit import compiled
 from calibration.observations import Floats
 
 _RMS, _RMS_RAD, _RMS_BOUND_RAD = "rms_rad", 1e-3, 5e-3
-_SIGMAS_RAD = (0.4e-3, 0.7e-3)  # of a weight; a curve has an RMS of about 0.7 of it
+_SIGMAS_RAD = (0.4e-3, 0.7e-3)  # prior sigmas of a weight; the RMS of the curve is about 0.7 times this
 _LEAST_PIECES, _MOST_PIECES, _PIECE_RATIO = 9, 360, 1.5
 _LEAST_PIECE_DEG = 1.25
 _POSES_PER_PIECE = 2
-_SAME_DEG = 0.1  # angles closer than this are one pose's
-_WHOLE_TURN_DEG = 300.0  # who covers more has met himself at the other end, or nearly
-_GRID = 16  # points in a piece
+_SAME_DEG = 0.1  # angles closer than this belong to the same pose
+_WHOLE_TURN_DEG = 300.0  # a wider range counts as a full turn, with the curve closed
+_GRID = 16  # points per piece
 _ON_RANGE, _ON_TURN = {"low_deg", "high_deg", "pieces", "sigma_rad"}, {"pieces", "sigma_rad"}
 
 
 class JointErrorMap(JointFamily):
-    """A sum of cubic B-splines, evenly spaced over the range of the training data or over the turn.
+    """A sum of cubic B-splines, evenly spaced over the range of the training data or over a full turn.
 
-    With independent weights of one size this is a stationary Gaussian process whose waves are longer than about two
-    pieces (Higdon 2002, process convolutions): the number of pieces says how fine the curve may be, `sigma_rad` how
-    large, and the data choose both. An angle touches four splines however many there are, which is what keeps
-    predictions fast.
+    With independent weights of equal size this is a stationary Gaussian process with wavelengths longer than about two
+    pieces (Higdon 2002, process convolutions). The number of pieces sets the resolution of the curve and `sigma_rad`
+    its size; the data select both. Only four splines are nonzero at any angle, which keeps predictions fast.
 
-    The curve is not rid of the slow parts that encoder_harmonic and angle_scale have: where one of these explains the
-    data, it does so with two coefficients or one, and its evidence is the greater. Beyond the trained range a curve
-    stays at its end. A range of more than 300 deg is a turn, and the curve closes.
+    The curve includes the slow parts that encoder_harmonic and angle_scale describe. Where one of these explains the
+    data, it needs only one or two coefficients, so its evidence is greater. Beyond the trained range the curve is
+    constant. A range of more than 300 deg counts as a full turn, and the curve is periodic.
     """
 
     name = "joint_error_map"
-    equation = "d_theta = sum of c_i B_i(theta), B_i even cubic B-splines, theta as read"
+    equation = "d_theta = sum of c_i B_i(theta), B_i evenly spaced cubic B-splines, theta as read"
     source = "P-splines (Eilers and Marx 1996) with independent weights (Higdon 2002)"
     kind = "revolute"
-    goes_by_readings = True
+    depends_on_readings_only = True
     confused_with = ("encoder_harmonic", "angle_scale", "joint_compliance")
-    revealed_by = "poses that fill the joint's range densely, several in each wave of the curve"
+    revealed_by = "poses that cover the joint's range densely, several in each wave of the curve"
 
     def variants(self, context: EffectContext, where: str) -> tuple[Settings, ...]:
         reading = context.reading(where)
@@ -68,12 +67,12 @@ class JointErrorMap(JointFamily):
         if not sound or settings.get("low_deg", -math.inf) >= settings.get("high_deg", math.inf):
             raise ValueError(
                 f"the settings are pieces (a whole number from {_LEAST_PIECES} to {_MOST_PIECES}) and sigma_rad, with "
-                "low_deg and high_deg where it is no whole turn"
+                "low_deg and high_deg unless it is a full turn"
             )
         return tuple(f"basis{number}_rad" for number in range(1, _count(settings) + 1))
 
     def coefficients(self, context: EffectContext, where: str, settings: Settings) -> tuple[Coefficient, ...]:
-        """Return the weights of the splines; a wave of the greatest RMS is within their bounds."""
+        """Return the weights of the splines; their bounds allow a wave of the largest RMS."""
         del context, where
         bound = math.sqrt(2.0) * _RMS_BOUND_RAD
         return tuple(Coefficient(name, "rad", settings["sigma_rad"], -bound, bound) for name in self.names(settings))
@@ -87,9 +86,9 @@ class JointErrorMap(JointFamily):
     def reported(
         self, settings: Settings, coefficients: tuple[FittedCoefficient, ...]
     ) -> tuple[FittedCoefficient, ...]:
-        """Return the RMS of the curve about its mean over its range: the mean is as well an offset of the joint.
+        """Return the RMS of the curve about its mean over its range, as the mean is not separable from a joint offset.
 
-        Its standard error takes those of the weights for independent.
+        Its standard error treats the errors of the weights as independent.
         """
         weights = np.array([c.value for c in coefficients])
         errors = np.array([c.standard_error for c in coefficients])
@@ -100,12 +99,12 @@ class JointErrorMap(JointFamily):
 
 
 def _count(settings: Settings) -> int:
-    """Return the number of splines; those at the ends of a range reach beyond it."""
+    """Return the number of splines; on a range that is not a full turn, three extend beyond its ends."""
     return int(settings["pieces"]) + (3 if "low_deg" in settings else 0)
 
 
 def _splines(angle_deg: Floats, settings: Settings, unit: float = 1.0) -> Floats:
-    """Return the values (n, k) of all splines, times `unit`."""
+    """Return the values (n, k) of all splines, multiplied by `unit`."""
     is_turn = "low_deg" not in settings
     low, high = (0.0, 360.0) if is_turn else (settings["low_deg"], settings["high_deg"])
     out = np.zeros((len(angle_deg), _count(settings)))
@@ -115,7 +114,7 @@ def _splines(angle_deg: Floats, settings: Settings, unit: float = 1.0) -> Floats
 
 @cache
 def _squares(pieces: int, is_turn: bool) -> Floats:
-    """Return the covariance (k, k) of the splines over the range: w' S w is a curve's mean square about its mean."""
+    """Return the covariance S (k, k) of the splines over the range; w' S w is the variance of a curve."""
     settings = {"pieces": float(pieces), "sigma_rad": 1.0} | ({} if is_turn else {"low_deg": 0.0, "high_deg": 360.0})
     middle_deg = np.asarray((np.arange(_GRID * pieces) + 0.5) * (360.0 / (_GRID * pieces)), dtype=np.float64)
     values = _splines(middle_deg, settings)
@@ -125,10 +124,10 @@ def _squares(pieces: int, is_turn: bool) -> Floats:
 
 @compiled
 def _fill(angle_deg: Floats, low: float, high: float, pieces: int, is_turn: bool, unit: float, out: Floats) -> None:
-    """Put the four splines that each angle touches, times `unit`, into its row of zeros."""
+    """Write the four nonzero splines of each angle, multiplied by `unit`, into its row of zeros."""
     for n in range(len(angle_deg)):
         if not math.isfinite(angle_deg[n]):
-            out[n] = math.nan  # in sight; as an index it would not be
+            out[n] = math.nan  # propagate NaN, which must not become an index
             continue
         at = (angle_deg[n] - low) / (high - low)
         at = pieces * (at - np.floor(at) if is_turn else min(1.0, max(0.0, at)))

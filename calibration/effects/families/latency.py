@@ -1,4 +1,4 @@
-"""A fix that comes late: stamped after the instant at which the boom was there."""
+"""A fix whose timestamp is later than the instant of the measurement."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from calibration.observations import Floats
 
 
 class Latency(SizedFamily):
-    """The fix stamped t shows the boom where it was at t - latency; nothing where it stands."""
+    """A fix with timestamp t shows the boom at t - latency; no effect while the boom stands still."""
 
     name = "latency"
     equation = "shift = -J_q (dq/dt) * seconds"
-    source = "delay of a total station's fixes against other sensors (Thalmann and Neuner 2021)"
+    source = "delay of a total station's fixes relative to other sensors (Thalmann and Neuner 2021)"
     confused_with = ("clock_drift", "backlash", "load_hysteresis")
-    revealed_by = "the same path driven through without a stop at two speeds, and stopped on"
+    revealed_by = "the same path driven without a stop at two speeds, and with stops"
     fixed = (Coefficient("seconds", "s", 0.05, -0.3, 0.3),)
     place = "clock"
     moves_machine = False

@@ -1,4 +1,4 @@
-"""A link that gives way to the side: it bends out of its joint's plane, and its bearing tilts."""
+"""A link that deflects sideways: it bends out of its joint's plane, and its bearing tilts."""
 
 from __future__ import annotations
 
@@ -10,21 +10,22 @@ from calibration.rig.description import Rig
 
 
 class LateralCompliance(LinkFamily):
-    """A link turns about the two axes across its joint's, in proportion to the weights' moment about these.
+    """A link turns about the two axes perpendicular to its joint's axis, in proportion to the moments about them.
 
-    About the joint's own axis it is stiff: that is `joint_compliance`. A slewing boom's bearing tilts with the whole
-    moment of the boom; a lifting one twists by what hangs beside it, and leans where the machine stands on a slope. The
-    first joint that turns has no place: what tilts there is the base (`base_compliance`).
+    About the joint's own axis the link is taken as stiff; that deflection is `joint_compliance`. The bearing of a
+    slewing boom tilts with the full moment of the boom. A lifting boom twists under loads off its axis, and leans where
+    the machine stands on a slope. The first turning joint is not a place: a tilt there is that of the base
+    (`base_compliance`).
     """
 
     name = "lateral_compliance"
     equation = (
         "turn about the joint's place = compliance * (M - (M z) z), M the moment of all weights beyond, z the axis"
     )
-    source = "bearing and link as a linear spring against tilting, equal about both axes across the joint's"
-    comes_after = ("joint_compliance",)
+    source = "bearing and link as a linear spring against tilting, equal about both axes perpendicular to the joint's"
+    secondary_to = ("joint_compliance",)
     confused_with = ("joint_compliance", "base_compliance", "boom_droop")
-    revealed_by = "loads far out to the side of the link: the head turned to either side, or the machine on a slope"
+    revealed_by = "loads far to the side of the link: the head turned to either side, or the machine on a slope"
 
     def places(self, rig: Rig) -> tuple[str, ...]:
         turning = set(turning_rows(rig)) if rig.masses else set()
@@ -33,7 +34,7 @@ class LateralCompliance(LinkFamily):
     def row(self, rig: Rig, where: str) -> int:
         return own_rows(rig)[where]
 
-    def given_way_to(self, axis: Floats, moments: Floats) -> Floats:
+    def deflecting_moment(self, axis: Floats, moments: Floats) -> Floats:
         about = np.einsum("ni,nik->nk", axis, moments)
         across: Floats = moments - axis[:, :, None] * about[:, None]
         return across

@@ -1,4 +1,4 @@
-"""A cylinder that sinks while the machine stands."""
+"""A cylinder that sinks while the machine stands still."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ _DWELL, _WITH_LOAD = "dwell_s", "with_load"
 
 
 class LeakDown(JointFamily):
-    """The joint goes down with the time since the last motion, beyond what its encoder sees.
+    """The joint sinks with the time since the last motion, in addition to the motion that its encoder measures.
 
-    Down is where its value falls, or where its load goes: on many machines a cylinder that sinks makes the value rise,
-    and a joint that swings over its dead centre sinks to either side. The data choose.
+    Sinking either lowers the joint's value, or follows the direction of its load. On many machines a sinking cylinder
+    raises the value, and a joint that swings over its dead centre sinks to either side. The data select the variant.
     """
 
     name = "leak_down"
     equation = "d_theta = -rate * dwell (column dwell_s), or rate * dwell * sign(torque)"
     source = "internal leakage of cylinders and load-holding valves, a drift test of lifting machines"
     confused_with = ("base_settlement", "joint_compliance")
-    revealed_by = "standing still in one pose and measuring at once, after a minute and after ten"
+    revealed_by = "standing still in one pose and measuring immediately, after one minute and after ten"
     fixed = (Coefficient("rad_per_s", "rad/s", 1e-5, 0.0, 5e-5),)
     column = "dwell_s"
     kind = "revolute"
@@ -46,8 +46,8 @@ class LeakDown(JointFamily):
     def check_settings(self, settings: Settings) -> None:
         if set(settings) != {_DWELL, _WITH_LOAD} or settings[_DWELL] <= 0.0 or settings[_WITH_LOAD] not in (0.0, 1.0):
             raise ValueError(
-                f"the settings are {_DWELL}, the usual dwell of the training rows, and {_WITH_LOAD}, whether it goes "
-                "where the load does"
+                f"the settings are {_DWELL}, the RMS dwell of the training rows, and {_WITH_LOAD}, 1 if the joint "
+                "sinks in the direction of the load, else 0"
             )
 
     def columns(self, context: EffectContext, where: str, settings: Settings) -> Floats:

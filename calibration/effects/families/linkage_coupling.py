@@ -1,4 +1,4 @@
-"""A linkage that turns a second row by a little more, or less, than it should."""
+"""A linkage that turns a second row by slightly more or less than its nominal ratio."""
 
 from __future__ import annotations
 
@@ -11,16 +11,18 @@ from calibration.rig.description import Rig
 
 
 class LinkageCoupling(PrismFamily):
-    """One joint drives several rows; those after the first follow it with a ratio that is off.
+    """One joint drives several rows, and the rows after the first follow it with a wrong ratio.
 
-    The joint's own row, the first, does as its encoder says.
+    The first row is the joint's own and follows its encoder.
     """
 
     name = "linkage_coupling"
-    equation = "value of the coupled row = (1 + coupling) * its nominal one, as theta2 = -(1+k) theta1"
+    equation = "value of the coupled row = (1 + coupling) * its nominal value, for example theta2 = -(1+k) theta1"
     source = "a parallel linkage whose opposite links differ in length, first order"
     confused_with = ("angle_scale", "joint_compliance")
-    revealed_by = "the whole range of the driving joint, far out and near, at several of the joints beyond"
+    revealed_by = (
+        "the whole range of the driving joint, at long and short reach, with joints beyond it at several values"
+    )
     fixed = (Coefficient("coupling", "1", 2e-3, -1e-2, 1e-2),)
 
     def places(self, rig: Rig) -> tuple[str, ...]:

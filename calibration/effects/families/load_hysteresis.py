@@ -9,7 +9,7 @@ from calibration.effects.base import Coefficient, JointFamily, Settings
 from calibration.effects.context import EffectContext
 from calibration.effects.load_shapes import (
     UNIT,
-    OfUncertainLoad,
+    UncertainLoadFamily,
     gravity_shapes,
     load_columns,
     load_variants,
@@ -22,19 +22,20 @@ _SIGMA_RAD = 0.5e-3  # at the largest torque
 _BOUND_RAD = 5e-3
 
 
-class LoadHysteresis(OfUncertainLoad, JointFamily):
-    """Friction holds one side of a yielding drive back by the load.
+class LoadHysteresis(UncertainLoadFamily, JointFamily):
+    """Friction holds back one side of a compliant drive, in proportion to the load.
 
-    Where it is the encoder's, the joint is further along its last motion. Behind an encoder at the motor the joint
-    lags, and the coefficient is negative. As for a compliance, variants have what uncertain masses leave open.
+    If this is the encoder's side, the joint is further along in the direction of its last motion. With an encoder at
+    the motor the joint lags, and the coefficient is negative. As for a compliance, variants include the uncertainty of
+    the load's course due to uncertain masses.
     """
 
     name = "load_hysteresis"
     equation = "d_theta = k * direction of the last motion * |torque|; k < 0: the joint lags"
     source = "Coulomb friction in loaded bearings and gears (Armstrong-Helouvry et al. 1994)"
     confused_with = ("backlash", "gravity_flip_play")
-    revealed_by = "coming to the same pose from both sides, under little load and under great load"
-    goes_with = "torque"
+    revealed_by = "approaching the same pose from both sides, at low and at high load"
+    load_kind = "torque"
     kind = "revolute"
 
     def needs(self, where: str) -> str:
@@ -71,9 +72,9 @@ class LoadHysteresis(OfUncertainLoad, JointFamily):
         return np.degrees(side[:, None] * columns)
 
     def unknown_variance(self, values: Floats, plausible: Floats, settings: Settings) -> float:
-        """Return the mean square for a load that goes as a sine, up to the largest one in the work volume."""
+        """Return the mean square for a load that varies as a sine, up to the largest load in the work volume."""
         del settings
-        most = _SIGMA_RAD / float(plausible[0])  # as `coefficients` has it
+        most = _SIGMA_RAD / float(plausible[0])  # inverse of `coefficients`
         return 0.5 * float(np.degrees(most * values[0])) ** 2
 
 

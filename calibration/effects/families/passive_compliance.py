@@ -1,4 +1,4 @@
-"""A passive row that gives way: the link of a parallel linkage that nothing but other joints turns."""
+"""A passive row that deflects: the link of a parallel linkage that is turned only through other joints."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ _PLACE = "row"
 
 
 class PassiveCompliance(LinkFamily):
-    """A row that turns by a coupling, and is no encoder's own, turns further in proportion to its load.
+    """A row that is turned through a coupling and has no encoder of its own turns further in proportion to its load.
 
-    Its place is the row's number in the rig file: `row2`. Own rows of a joint, the first that it turns, are in
-    `joint_compliance`; a row that a cylinder turns is here, as no encoder reads its angle.
+    Its place is the row's number in the rig file: `row2`. The first row that a joint turns is its own and belongs to
+    `joint_compliance`. A row that a cylinder turns belongs here, as no encoder measures its angle.
     """
 
     name = "passive_compliance"
     equation = "d_theta of the row = compliance * moment of all weights beyond about the row's axis"
-    source = "a linkage's rods and pins as a linear spring: deflection = torque / stiffness"
+    source = "rods and pins of a linkage as a linear spring: deflection = torque / stiffness"
     confused_with = ("joint_compliance", "base_compliance", "linkage_coupling")
-    revealed_by = "a prism on the link that the linkage holds, under little load and under much"
+    revealed_by = "a prism on the link that the linkage holds, at low and at high load"
 
     def places(self, rig: Rig) -> tuple[str, ...]:
         own = own_rows(rig).values()
@@ -32,7 +32,7 @@ class PassiveCompliance(LinkFamily):
         del rig
         return int(where.removeprefix(_PLACE))
 
-    def given_way_to(self, axis: Floats, moments: Floats) -> Floats:
+    def deflecting_moment(self, axis: Floats, moments: Floats) -> Floats:
         about: Floats = axis[:, :, None] * np.einsum("ni,nik->nk", axis, moments)[:, None]
         return about
 

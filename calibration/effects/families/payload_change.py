@@ -1,4 +1,4 @@
-"""A joint that gives way to a payload."""
+"""A joint that deflects under a payload."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from calibration.effects.context import EffectContext
 from calibration.effects.load_shapes import (
     UNIT,
     LoadShapes,
-    OfUncertainLoad,
+    UncertainLoadFamily,
     load_columns,
     load_variants,
     part_coefficients,
@@ -21,25 +21,25 @@ from calibration.effects.load_shapes import (
 )
 from calibration.observations import Floats
 
-_SIGMA_RAD = 1e-3  # at the largest torque, as of a compliance
+_SIGMA_RAD = 1e-3  # at the largest torque, as for `joint_compliance`
 _BOUND_RAD = 20e-3
 _TORQUE = "torque_Nm"
-_PAYLOAD_KG = 100.0  # whose load has the shapes
+_PAYLOAD_KG = 100.0  # payload for which the load shapes are computed
 _COLLINEAR = 1e-9
 
 
-class PayloadChange(OfUncertainLoad, JointFamily):
-    """Deflection by what the payload adds to the joint's load, and by nothing else.
+class PayloadChange(UncertainLoadFamily, JointFamily):
+    """Deflection by the payload's part of the joint's load only.
 
-    How heavy the payload is has been measured; variants have what its centre of gravity leaves open.
+    The mass of the payload is measured. Variants include the uncertainty due to its centre of gravity.
     """
 
     name = "payload_change"
     equation = "d_theta = compliance * (torque with payload_kg - torque without)"
     source = "ICIC 2020, Eqs. 16, 17, for the payload's part of the load"
     confused_with = ("joint_compliance", "base_step", "boom_droop")
-    revealed_by = "the same poses with the payload and without it, in turns"
-    goes_with = "weights"
+    revealed_by = "the same poses with and without the payload, alternating"
+    load_kind = "weights"
     kind = "revolute"
 
     def needs(self, where: str) -> str:
@@ -63,7 +63,7 @@ class PayloadChange(OfUncertainLoad, JointFamily):
 
     def names(self, settings: Settings) -> tuple[str, ...]:
         if settings.get(_TORQUE, 0.0) <= 0.0:
-            raise ValueError(f"the setting {_TORQUE} must be there, the payload's usual torque in the training rows")
+            raise ValueError(f"the setting {_TORQUE}, the payload's RMS torque in the training rows, must be above 0")
         return ("compliance_rad_per_Nm", *part_names(_of_parts(settings)))
 
     def coefficients(self, context: EffectContext, where: str, settings: Settings) -> tuple[Coefficient, ...]:
@@ -93,7 +93,7 @@ def _of_parts(settings: Settings) -> Settings:
 
 
 def _shapes(context: EffectContext, where: str) -> LoadShapes:
-    """Return the shapes by the payload's uncertain centre of gravity; its weight has been measured."""
+    """Return the load shapes due to the payload's uncertain centre of gravity; its mass is measured."""
 
     def of(volume: EffectContext) -> tuple[Floats, Floats]:
         extra = {"payload_kg": np.full(len(volume), _PAYLOAD_KG)}

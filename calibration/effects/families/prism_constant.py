@@ -1,4 +1,4 @@
-"""A prism's constant that is not the one the station was told."""
+"""A prism constant that differs from the station's setting."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ from calibration.observations import Floats
 from calibration.rig.description import Rig
 
 _SHARED = "station"
-_USUAL_MM = 30.0  # what one confuses: 0, 30 and 34.4 mm are the makers' constants
+_USUAL_MM = 30.0  # size of a mix-up: usual constants of manufacturers are 0, 30 and 34.4 mm
 _USUAL_ODDS = 0.2
 
 
 class PrismConstant(PrismFamily):
-    """Every distance to a prism is off by the same, or that to all prisms where the station has the wrong setting.
+    """A constant distance error of one prism, or of all prisms if the station has the wrong setting.
 
-    The error is small, or it is the difference of two makers' constants: the variant that has `sigma_mm`.
+    The error is small, or it is the difference of two manufacturers' constants: the variant with `sigma_mm`.
     """
 
     name = "prism_constant"
     equation = "shift = mm * (unit vector from the station to the prism)"
-    source = "additive constant of reflectors (ISO 17123-4); makers' usual ones are 0, 30 and 34.4 mm"
+    source = "additive constant of reflectors (ISO 17123-4); usual values of manufacturers are 0, 30 and 34.4 mm"
     confused_with = ("prism_incidence", "station_scale")
-    revealed_by = "the same poses from a second set-up that sees the prism from another side"
+    revealed_by = "the same poses from a second set-up that sees the prism from a different side"
     moves_machine = False
 
     def places(self, rig: Rig) -> tuple[str, ...]:
@@ -32,7 +32,7 @@ class PrismConstant(PrismFamily):
 
     def variants(self, context: EffectContext, where: str) -> tuple[Settings, ...]:
         seen = np.unique(context.data.prism)
-        # With a single prism in the data its own constant and that of all are the same.
+        # With a single prism in the data, its own constant and the shared one are the same.
         possible = len(seen) > 1 if where == _SHARED else context.rig.prism_names.index(where) in seen
         return ({}, {"sigma_mm": _USUAL_MM}) if possible else ()
 

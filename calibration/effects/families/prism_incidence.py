@@ -1,4 +1,4 @@
-"""A 360 degree prism whose distance depends on the side it is seen from."""
+"""A 360 degree prism whose distance error depends on the side from which it is seen."""
 
 from __future__ import annotations
 
@@ -9,23 +9,24 @@ from calibration.effects.context import EffectContext
 from calibration.observations import Floats
 from calibration.rig.description import Rig
 
-_LEAST = 1e-9  # cosine of a line of sight that is along the prism's own axis
+_LEAST = 1e-9  # smallest component across the prism's axis; below it the line of sight is along the axis
 _AXIS = "axis"
 _AXES = (3.0, 1.0, 2.0)  # z, x, y
 
 
 class PrismIncidence(PrismFamily):
-    """The first harmonic of the azimuth psi at which the station is seen about the prism's own axis.
+    """The first harmonic of psi, the azimuth of the station about the prism's own axis.
 
-    A rig file does not say how a prism stands on its frame, so that the axis is one of the frame's three, as the data
-    have it: 1 for x, 2 for y, 3 for z. psi is 0 along the axis that follows it (x after z), 90 deg along the next.
+    A rig file does not give the orientation of a prism on its frame. The axis is one of the frame's three axes,
+    selected by the data: 1 for x, 2 for y, 3 for z. psi is 0 along the next axis in cyclic order (x after z), and
+    90 deg along the one after that.
     """
 
     name = "prism_incidence"
     equation = "shift = (cos1 cos psi + sin1 sin psi) * (unit vector from the station to the prism)"
-    source = "360 degree prisms err by several mm with the angle of incidence (Favre and Hennes 2000)"
+    source = "errors of 360 degree prisms of several mm, depending on the angle of incidence (Favre and Hennes 2000)"
     confused_with = ("prism_constant", "encoder_harmonic", "angle_scale")
-    revealed_by = "poses that turn the prism all round before the station, or a second set-up"
+    revealed_by = "poses that turn the prism through all directions to the station, or a second set-up"
     fixed = (Coefficient("cos1_mm", "mm", 1.0, -8.0, 8.0), Coefficient("sin1_mm", "mm", 1.0, -8.0, 8.0))
     moves_machine = False
 

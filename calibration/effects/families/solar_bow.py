@@ -12,15 +12,15 @@ from calibration.rig.description import Rig
 
 _COLUMN = "temperature_degC"
 _SETTINGS = ("mean_degC", "change_degC", "frame")
-_LEAST_LINK_MM = 500.0  # shorter offsets are brackets, no links
-_JOINT_ANGLE = 0  # in place of a frame: the joint's own angle is the elevation
+_LEAST_LINK_MM = 500.0  # shorter offsets are brackets, not links
+_JOINT_ANGLE = 0  # setting `frame` of the variant that uses the joint's own angle as the elevation
 
 
 class SolarBow(JointFamily):
-    """The sun-side flange of a link gets longer: the link bows, most where it lies flat under the sun.
+    """The sun-side flange of a link gets longer, and the link bows, most when it is horizontal.
 
-    The link is what the joint moves: from its axis to the origin of the next frame that is half a metre away or more.
-    Where a link is level when its joint reads zero, the joint's angle is taken for the elevation; that is a variant.
+    The link extends from the joint's axis to the origin of the next frame at a distance of half a metre or more. A
+    variant uses the joint's angle as the elevation, for a link that is level when its joint reads zero.
     """
 
     name = "solar_bow"
@@ -74,7 +74,7 @@ def _axis_frame(rig: Rig, where: str) -> tuple[int, int]:
 
 
 def _link_end(context: EffectContext, where: str) -> int | None:
-    """Return the frame at which the link ends that a joint moves; None where it moves none."""
+    """Return the frame at the end of the link that a joint moves; None if there is no such link."""
     rig, frames_mm = context.rig, context.located.frames_mm
     row, own = _axis_frame(rig, where)
     for frame in range(own + 1, len(rig.rows) + 1):
@@ -86,7 +86,7 @@ def _link_end(context: EffectContext, where: str) -> int | None:
 
 
 def _change_K(context: EffectContext, where: str, settings: Settings) -> Floats:  # noqa: N802 - the unit is K
-    """Return the change of temperature (n,) times the cosine of the link's elevation."""
+    """Return the temperature change (n,) multiplied by the cosine of the link's elevation, K."""
     warmer: Floats = np.nan_to_num(context.extra(_COLUMN) - settings["mean_degC"])
     rig, end = context.rig, int(settings["frame"])
     if end == _JOINT_ANGLE:

@@ -1,4 +1,4 @@
-"""A machine that grows with its temperature."""
+"""A machine that expands with its temperature."""
 
 from __future__ import annotations
 
@@ -14,18 +14,19 @@ _FORMS: tuple[Settings, ...] = ({}, {_AS_IT_IS: 1.0})
 
 
 class ThermalExpansion(SizedFamily):
-    """All lengths grow alike, from the base's origin: the kinematics hold at the mean temperature of the training.
+    """All lengths expand equally from the base's origin; the kinematics hold at the mean temperature of the training.
 
-    What a prism is mounted on, such as a robot's tool, may be of a material that does not grow; the data choose.
+    The part on which a prism is mounted, such as a robot's tool, may be of a material that does not expand; this is a
+    variant, which the data select.
     """
 
     name = "thermal_expansion"
     equation = "all lengths * (1 + per_K * (T - mean T of the training data))"
-    source = "linear expansion of steel, 12e-6 per K +-30 % with what is not steel (EN 1993-1-1)"
+    source = "linear expansion of steel, 12e-6 per K, +-30 % due to other materials (EN 1993-1-1)"
     confused_with = ("station_scale", "base_settlement", "solar_bow")
-    revealed_by = "the same far poses at another temperature, cold in the morning and warm at noon"
+    revealed_by = "the same far poses at different temperatures, cold in the morning and warm at noon"
     fixed = (Coefficient("per_K", "1/K", 12e-6, 0.0, 2.5e-5),)
-    place = "boom"  # the whole machine, whatever it is
+    place = "boom"  # the whole machine, also without a boom
     column = _COLUMN
 
     def variants(self, context: EffectContext, where: str) -> tuple[Settings, ...]:
@@ -38,7 +39,7 @@ class ThermalExpansion(SizedFamily):
         return (all_of_it,) if all_of_it["size1_mm"] == links["size1_mm"] else (all_of_it, links)
 
     def form(self, settings: Settings) -> str:
-        return "the prisms' mountings do not grow" if _AS_IT_IS in settings else ""
+        return "the prisms' mountings do not expand" if _AS_IT_IS in settings else ""
 
     def check_settings(self, settings: Settings) -> None:
         form = {name: value for name, value in settings.items() if name == _AS_IT_IS}
@@ -52,7 +53,7 @@ class ThermalExpansion(SizedFamily):
 
 
 def _shift_mm(context: EffectContext, settings: Settings) -> Floats:
-    """Return the growth (n, 3, 1), mm K."""
+    """Return the displacements (n, 3, 1) per unit of expansion coefficient, mm K."""
     warmer = np.nan_to_num(context.extra(_COLUMN) - settings["mean_degC"])
     grown = _mounted_mm(context) if _AS_IT_IS in settings else context.located.prism_mm
     return context.to_station((warmer[:, None] * grown)[:, :, None])

@@ -1,4 +1,4 @@
-"""A length transducer that slips a little with every metre."""
+"""A length transducer that slips slightly with every metre of travel."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ _MOST_KNOTS = 16
 class TransducerCumulative(JointFamily):
     """True length minus reading grows with the path that the transducer has travelled, in the order of the rows' times.
 
-    The settings hold when how much of it was travelled, for other rows of the same days; the path stands still before
-    the first instant and after the last. Rows none of which has a time, and those for a model that was trained without,
-    are taken as one run, by time or else in their order, from a transducer that has been set to zero at the first. The
-    mean path of the training belongs to the kinematics.
+    The settings tabulate the path over time, for other rows of the same days. The path is constant before the first
+    instant and after the last. Without times in the rows or in the model, the rows are treated as one run, ordered by
+    time or else as given, with the path zero at the first row. The mean path of the training data is absorbed by the
+    kinematics.
     """
 
     name = "transducer_cumulative"
-    equation = "d_L = k * (path travelled - its mean in the training data), in m"
+    equation = "d_L = k * (travelled path - its mean in the training data), path in m"
     source = "slip of a draw wire or a measuring wheel"
     confused_with = ("transducer_index_jump", "base_settlement", "base_step")
-    revealed_by = "returning to a pose measured before, after running the joint to and fro many times"
+    revealed_by = "returning to a pose measured before, after moving the joint back and forth many times"
     fixed = (Coefficient("mm_per_m", "mm/m", 0.03, -0.3, 0.3),)
     kind = "prismatic"
-    goes_by_travel = True
+    depends_on_travel = True
 
     def needs(self, where: str) -> str:
         del where
@@ -42,7 +42,7 @@ class TransducerCumulative(JointFamily):
 
     def variants(self, context: EffectContext, where: str) -> tuple[Settings, ...]:
         known, time_s = self.known(context, where), context.extra("time_s")
-        order = np.argsort(time_s[known], kind="stable")  # as they come where there are no times
+        order = np.argsort(time_s[known], kind="stable")  # keeps the given order where there are no times
         path_m = _travelled_m(context.reading(where)[known][order])
         if not len(path_m) or path_m[-1] == 0.0:
             return ()
@@ -56,14 +56,16 @@ class TransducerCumulative(JointFamily):
         table = {name: value for i, knot in enumerate(knots) for name, value in zip(_knot(i), knot, strict=True)}
         return ({_MEAN: mean, **table},)
 
-    def goes_by_order(self, settings: Settings) -> bool:
+    def depends_on_order(self, settings: Settings) -> bool:
         return not _table(settings).size
 
     def check_settings(self, settings: Settings) -> None:
         knots = len(settings) // 2
         expected = {_MEAN, *(name for i in range(knots) for name in _knot(i))}
         if set(settings) != expected or knots > _MOST_KNOTS or not (np.diff(_table(settings)) > [[0.0], [-1e-9]]).all():
-            raise ValueError(f"the settings are {_MEAN}, and up to {_MOST_KNOTS} rising time_0_s with path_0_m")
+            raise ValueError(
+                f"the settings are {_MEAN}, and up to {_MOST_KNOTS} pairs time_0_s and path_0_m ... in rising order"
+            )
 
     def columns(self, context: EffectContext, where: str, settings: Settings) -> Floats:
         time_s, (times, paths) = context.extra("time_s"), _table(settings)
@@ -77,14 +79,14 @@ class TransducerCumulative(JointFamily):
         return change
 
     def unknown_variance(self, values: Floats, plausible: Floats, settings: Settings) -> float:
-        """Return the mean square for a path that may be any of those in training."""
+        """Return the mean square for a random path of the training range."""
         del plausible
         paths = _table(settings)[1]
         return (float(values[0]) * float(np.std(paths if len(paths) else [0.0, 2.0 * settings[_MEAN]]))) ** 2
 
 
 def _travelled_m(reading_mm: Floats) -> Floats:
-    """Return the path (n,) from the first of the rows, in their order."""
+    """Return the travelled path (n,) since the first row, in the order of the rows."""
     path_m: Floats = np.abs(np.diff(reading_mm, prepend=reading_mm[:1])).cumsum() / 1e3
     return path_m
 
@@ -94,7 +96,7 @@ def _knot(number: int) -> tuple[str, str]:
 
 
 def _table(settings: Settings) -> Floats:
-    """Return times and paths of the knots, (2, knots)."""
+    """Return the times and paths of the knots, (2, knots)."""
     return np.array([[settings[name] for name in names] for names in zip(*_knots(settings), strict=True)]).reshape(
         2, -1
     )

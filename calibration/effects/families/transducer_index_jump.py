@@ -7,13 +7,13 @@ from calibration.effects.timing import JointStepFamily
 
 
 class TransducerIndexJump(JointStepFamily):
-    """From an instant on, true length minus reading is another one: counts were lost, or a draw wire has slipped."""
+    """From an instant on, true length minus reading is offset: counts were lost, or a draw wire slipped."""
 
     name = "transducer_index_jump"
     equation = "d_L = jump for t > t0, t0 found from the data"
     source = "lost counts or a wrong reference mark of an incremental length transducer"
     confused_with = ("transducer_cumulative", "base_step", "base_settlement")
-    revealed_by = "returning to a pose measured before, and driving the transducer over its reference"
+    revealed_by = "returning to a pose measured before, and moving the transducer past its reference mark"
     fixed = (Coefficient("jump_mm", "mm", 8.0, -30.0, 30.0),)
     kind = "prismatic"
 

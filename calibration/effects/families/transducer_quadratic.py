@@ -1,4 +1,4 @@
-"""A length transducer whose characteristic is bent."""
+"""A length transducer with a nonlinear characteristic."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from calibration.observations import Floats
 
 
 class TransducerQuadratic(JointFamily):
-    """True length minus reading is a parabola about the middle of the stroke, the joint's limits being its ends."""
+    """True length minus reading is a parabola about the middle of the stroke, which ends at the joint's limits."""
 
     name = "transducer_quadratic"
     equation = "d_L = k (L - L_mid)^2, L as read"
     source = "linearity of length transducers (Zhou et al. 2022: 0.1 % of the stroke), second order"
     confused_with = ("transducer_scale", "boom_droop")
-    revealed_by = "the joint alone over its whole stroke, with its middle and both ends"
+    revealed_by = "the joint alone over its whole stroke, including its middle and both ends"
     fixed = (Coefficient("mm_per_m2", "mm/m^2", 5.0, -20.0, 20.0),)
     kind = "prismatic"
 

@@ -1,4 +1,4 @@
-"""A length transducer whose scale is off."""
+"""A length transducer with a scale error."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from calibration.observations import Floats
 
 
 class TransducerScale(JointFamily):
-    """True length minus reading grows with the length as read."""
+    """True length minus reading is proportional to the reading."""
 
     name = "transducer_scale"
     equation = "d_L = scale * L, L as read"

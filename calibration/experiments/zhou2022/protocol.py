@@ -187,7 +187,7 @@ def run_protocol(
             draws=draws,
         )
         path = trajectory(model, bare, training, held_out, run.part(0.9, 1.0))
-        warnings += _doubts_of_path(path)
+        warnings += _path_warnings(path)
         return Protocol(
             rig.name,
             len(training),
@@ -224,7 +224,7 @@ def _missing_motion(single: Flags) -> list[str]:
     return []
 
 
-def _doubts_of_path(path: Trajectory) -> list[str]:
+def _path_warnings(path: Trajectory) -> list[str]:
     found = []
     if len(path.rows) < POINTS:
         found.append(f"the trajectory has {len(path.rows)} points, not {POINTS}: prism {path.prism!r} has no more")

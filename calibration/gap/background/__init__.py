@@ -1,1 +1,1 @@
-"""Effects named beside a background: smooth errors that no library has, fitted along while names are sought."""
+"""Identification of effects in the presence of a background: smooth errors without a name, fitted simultaneously."""

@@ -1,9 +1,9 @@
-"""Columns of a smooth unknown: joint errors that depend on angles, and displacements over the work volume and time.
+"""Columns of a smooth background: joint errors that depend on angles, and displacements over work volume and time.
 
-A machine has more than a library has names for. What is left of it is smooth: an error of a joint that depends on its
-own angle or on those of two neighbours, a displacement that changes slowly over the work volume or with time. Each of
-these is a block of cosines whose amounts are normal with a standard deviation of their own, smaller for finer waves: a
-Gaussian process of few columns (Solin and Särkkä, Statistics and Computing 30, 2020).
+A machine has more errors than the library has effects. The remaining errors are smooth: an error of a joint that
+depends on its own angle or on those of two neighbours, or a displacement that changes slowly over the work volume or
+with time. Each is a block of cosines whose amplitudes are normal with a common scale, smaller for finer waves: a
+Gaussian process with few columns (Solin and Särkkä, Statistics and Computing 30, 2020).
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from calibration.effects.links import Link, own_rows, turning_rows
 from calibration.effects.timing import step_grid
 from calibration.observations import Floats
 
-_CURVE_WAVES = 10  # half waves of a joint's own reading
-_SURFACE_WAVES = 3  # of each of two angles
-_PAIR_WAVES = 2  # of each of two readings
-_PLACE_WAVES = 2  # of each coordinate
+_CURVE_WAVES = 10  # half waves over a joint's own reading
+_SURFACE_WAVES = 3  # half waves over each of two angles
+_PAIR_WAVES = 2  # half waves over each of two readings
+_PLACE_WAVES = 2  # half waves over each coordinate
 _TIME_WAVES, _MOST_WAVES = 8, 60
-_LEAST_TURN_DEG, _LEAST_STROKE_MM = 0.5, 2.0  # a joint that moves less has no curve
+_LEAST_TURN_DEG, _LEAST_STROKE_MM = 0.5, 2.0  # smallest range of a joint that gets a curve
 _ROWS_PER_WAVE = 8
-_WHOLE_TURN_DEG = 300.0  # who covers more meets himself at the other end, or nearly
+_WHOLE_TURN_DEG = 300.0  # a wider range counts as a full turn, with periodic waves
 _LEAST_NM = 1e-6
 _JOINT_SIGMA = {"revolute": 1e-3, "prismatic": 1.0}  # rad or mm
 
@@ -38,14 +38,14 @@ class Block:
     """One part of the background.
 
     Attributes:
-        name: of the block.
-        kind: `curve` of a joint's own reading, `surface` of two; `pair`, `place`, `time` for displacements; `event` for
-            all that is another from an instant on, `drift` for all that changes slowly with time; `elastic` for all
-            that gives way to loads; `formula`.
-        where: the joint that errs, else `station`.
-        text: on what it depends, or what has happened, for people.
-        columns: of the samples; prior sigmas are those of amounts of plausible size.
-        since_s: instant of an event; NaN for all others.
+        name: name of the block.
+        kind: `curve`, a function of the joint's own reading; `surface`, a function of two readings; `pair`, `place`,
+            `time` for displacements; `event` for a general change at an instant; `drift` for a general slow change with
+            time; `elastic` for compliance under loads; `formula`.
+        where: the joint that has the error, else `station`.
+        text: phrase for output: the variables that the block depends on, or the event.
+        columns: columns for the samples; prior sigmas correspond to plausible amplitudes.
+        since_s: instant of an event; NaN for other blocks.
     """
 
     name: str
@@ -62,11 +62,11 @@ class Block:
 
 
 def smooth_blocks(context: EffectContext, average: Callable[[Floats], Floats]) -> tuple[Block, ...]:
-    """Return the blocks beside which names are sought: errors of joints, and what wanders over place and time.
+    """Return the blocks of the standard background: joint errors, and displacements over place and time.
 
     Args:
-        context: of n observations.
-        average: makes values (m, ...) of samples from values (n, ...) of rows.
+        context: context of n observations.
+        average: function from values (n, ...) of rows to values (m, ...) of samples.
     """
     moving = _moving(context)
     curves = [_curve(context, name) for name in moving]
@@ -76,7 +76,7 @@ def smooth_blocks(context: EffectContext, average: Callable[[Floats], Floats]) -
 
 
 def possible_blocks(context: EffectContext, average: Callable[[Floats], Floats]) -> Iterator[Block]:
-    """Yield what any two joints may do together, errors of every joint and displacements, and what wanders faster.
+    """Yield blocks for faster drift, and for errors of any joint and displacements that depend on any two joints.
 
     Arguments are those of `smooth_blocks`.
     """
@@ -89,7 +89,7 @@ def possible_blocks(context: EffectContext, average: Callable[[Floats], Floats])
 
 
 def displacement_blocks(context: EffectContext, average: Callable[[Floats], Floats]) -> tuple[Block, ...]:
-    """Return blocks of displacements by pairs of joints: together with the smooth ones they see any structure.
+    """Return blocks of displacements by pairs of joints; with the smooth blocks they can represent any structure.
 
     Arguments are those of `smooth_blocks`.
     """
@@ -99,12 +99,12 @@ def displacement_blocks(context: EffectContext, average: Callable[[Floats], Floa
 def time_blocks(
     context: EffectContext, average: Callable[[Floats], Floats], *, fine: bool = False
 ) -> tuple[Block, ...]:
-    """Return displacements that wander with time, or with the order of rows where no time is known.
+    """Return displacements that vary with time, or with the order of rows where times are not known.
 
     Args:
-        context: of n observations.
-        average: as of `smooth_blocks`.
-        fine: with as short waves as so many rows can show.
+        context: context of n observations.
+        average: as for `smooth_blocks`.
+        fine: True for waves as short as the number of rows allows.
     """
     time_s = context.extra("time_s")
     at = time_s if np.isfinite(time_s).all() and np.ptp(time_s) > 0.0 else np.arange(float(len(context)))
@@ -122,12 +122,12 @@ def time_blocks(
 def event_blocks(
     context: EffectContext, average: Callable[[Floats], Floats], instants_s: Collection[float]
 ) -> Iterator[Block]:
-    """Yield what may be another from an instant on: zeros of all joints, and displacements linear in the place.
+    """Yield blocks for step changes at an instant: zeros of all joints, and displacements linear in the position.
 
     Args:
-        context: of n observations.
-        average: as of `smooth_blocks`.
-        instants_s: to look at beside those of a grid over the rows.
+        context: context of n observations.
+        average: as for `smooth_blocks`.
+        instants_s: instants to try in addition to a grid over the rows, s.
     """
     time_s = context.extra("time_s")
     grid = {step["time_s"] for step in step_grid(time_s)}
@@ -136,22 +136,22 @@ def event_blocks(
 
 
 def event_block(context: EffectContext, average: Callable[[Floats], Floats], of_row: Floats, border: float) -> Block:
-    """Return what may be another beyond a border: zeros of all joints, and displacements linear in the place.
+    """Return the block of step changes at a border: zeros of all joints, and displacements linear in the position.
 
     Args:
-        context: of n observations.
-        average: as of `smooth_blocks`.
-        of_row: (n,) time in s, or whatever else the rows are ordered by.
-        border: of it.
+        context: context of n observations.
+        average: as for `smooth_blocks`.
+        of_row: (n,) time in s, or a different variable that orders the rows.
+        border: value of `of_row` after which the changes apply.
     """
     name = f"event({border})"
     after = (of_row > border).astype(np.float64)[:, None]
-    text = f"more has changed at time_s = {border:g} than one effect says"
+    text = f"more has changed at time_s = {border:g} than one effect explains"
     return Block(name, "event", "station", text, _of_all(context, name, after, np.ones(1)).over(average), border)
 
 
 def drift_block(context: EffectContext, average: Callable[[Floats], Floats], of_row: Floats) -> Block:
-    """Return what may change steadily: zeros of all joints, and displacements linear in the place.
+    """Return the block of steady changes: zeros of all joints, and displacements linear in the position.
 
     Arguments are those of `event_block`.
     """
@@ -161,10 +161,10 @@ def drift_block(context: EffectContext, average: Callable[[Floats], Floats], of_
 
 
 def elastic_blocks(context: EffectContext, average: Callable[[Floats], Floats]) -> tuple[Block, ...]:
-    """Return what links and bearings do that give way in proportion to load, a block for each row that joints turn.
+    """Return a block for each row that joints turn: compliance of its link and bearing, proportional to the load.
 
-    It turns a little further about its axis by the moment of the weights beyond about it, and about the axes across by
-    the rest of that moment. The first of them is also what the base does.
+    The row turns about its own axis in proportion to that component of the moment of the weights beyond it, and about
+    the perpendicular axes in proportion to the rest. The block of the first row also represents the base.
 
     Arguments are those of `smooth_blocks`.
     """
@@ -211,7 +211,7 @@ def _curve(context: EffectContext, joint: str) -> Block:
 def _surfaces(
     context: EffectContext, average: Callable[[Floats], Floats], pair: Sequence[str], joints: Sequence[str]
 ) -> Iterator[Block]:
-    """Yield errors of some joints that depend on two, of the samples."""
+    """Yield blocks, for the samples, of errors of some joints that depend on a pair of joints."""
     (a, of_a), (b, of_b) = (_waves(context, name, _SURFACE_WAVES) for name in pair)
     values = average((a[:, :, None] * b[:, None, :]).reshape(len(context), -1))
     sizes = 1.0 / np.hypot(of_a[:, None], of_b).ravel()
@@ -232,7 +232,7 @@ def _pair(context: EffectContext, pair: Sequence[str]) -> Block:
 
 
 def _waves(context: EffectContext, joint: str, most: int) -> tuple[Floats, Floats]:
-    """Return waves (n, k) of a joint's reading and their numbers (k,): half waves of its range, or whole ones."""
+    """Return waves (n, k) of a joint's reading and their numbers (k,): half waves over its range, or waves per turn."""
     reading = context.reading(joint)
     if _kind(context, joint) == "revolute" and np.ptp(reading) > _WHOLE_TURN_DEG:
         number = np.arange(1, most // 2 + 2 if most % 2 else most // 2 + 1)
@@ -247,7 +247,7 @@ def _kind(context: EffectContext, joint: str) -> str:
 
 
 def _place(context: EffectContext) -> Block:
-    """Return displacements that depend on the place of the prism in the work volume, along three axes."""
+    """Return displacements along three axes that depend on the position of the prism in the work volume."""
     u = [_unit(axis) for axis in context.located.prism_mm.T]
     orders = [order for order in itertools.product(range(_PLACE_WAVES + 1), repeat=3) if any(order)]
     waves = np.stack(
@@ -264,7 +264,7 @@ def _unit(values: Floats) -> Floats:
 
 
 def _of_all(context: EffectContext, name: str, waves: Floats, sizes: Floats) -> EffectColumns:
-    """Return zeros of all joints and displacements linear in the place, each times waves (n, k) of sizes (k,)."""
+    """Return zeros of all joints and displacements linear in the position, each times waves (n, k) of sizes (k,)."""
     u = np.stack([np.ones(len(context)), *(2.0 * _unit(axis) - 1.0 for axis in context.located.prism_mm.T)], axis=1)
     places = (waves[:, :, None] * u[:, None, :]).reshape(len(u), -1)
     zeros = [_at_joint(context, joint, name, waves, sizes) for joint in _moving(context)]
@@ -284,7 +284,7 @@ def _at_joint(context: EffectContext, joint: str, name: str, values: Floats, siz
 
 
 def _shifts(name: str, waves: Floats, sizes: Floats) -> EffectColumns:
-    """Return (n, 3, 3 k) displacements along the station's axes, mm, by waves (n, k) of sizes (k,)."""
+    """Return (n, 3, 3 k) displacements along the station's axes, mm, as waves (n, k) with prior sizes (k,)."""
     shift = np.concatenate([waves[:, None, :] * axis[None, :, None] for axis in np.eye(3)], axis=2)
     count = shift.shape[2]
     return EffectColumns(

@@ -1,7 +1,7 @@
-"""Breaks: an instant after which the machine is another, as after a repair, a knock or another set-up of the data.
+"""Breaks: an instant after which the machine is different, such as a repair, a knock or a changed data set-up.
 
-All parameters of the kinematics may differ after it. An effect of the library that is a step has fewer coefficients and
-is named where it suffices; a break is what none of these explains.
+All parameters of the kinematics may differ after a break. A step effect of the library has fewer coefficients and is
+named where it suffices. A break is reported only if no such effect explains it.
 """
 
 from __future__ import annotations
@@ -21,24 +21,24 @@ from calibration.observations import ROW, Floats
 
 _BORDERS = 100
 _LEAST_SAMPLES = 60
-_SCALES = (0.1, 0.3, 1.0)  # of build tolerances, by which a machine may have changed
-_GROSS = 8.0  # times the median error, beyond which a sample counts less
+_SCALES = (0.1, 0.3, 1.0)  # possible sizes of the changes, in build tolerances
+_GROSS = 8.0  # multiple of the median error beyond which a sample is downweighted
 
 
 def find_break(problem: Problem, joint: JointFit) -> Break | None:
-    """Return the instant after which another machine is beyond doubt, in addition to the effects of a fit; or None.
+    """Return the break that is certain given the effects of a fit, or None.
 
-    Errors that wander with time are no break: these are as likely as two machines only where nothing changes at once.
+    A break must also be more probable than errors that vary gradually with time.
 
     Args:
         problem: the data.
         joint: kinematics and effects.
     """
-    samples, columns = problem.solution.samples, joint.situation.observations.extra
+    samples, columns = problem.solution.samples, joint.context.observations.extra
     if len(samples) < _LEAST_SAMPLES:
         return None
     variable = ROW if ROW in columns else "time_s"
-    of_row = joint.situation.extra(variable)
+    of_row = joint.context.extra(variable)
     if not np.isfinite(of_row).all():
         return None
     size = np.linalg.norm(joint.error_mm(problem.solution), axis=1)
@@ -50,19 +50,20 @@ def find_break(problem: Problem, joint: JointFit) -> Break | None:
     if found is None or found[0] < ODDS:
         return None
     found = max(_two_machines(projection, values, _between_neighbours(values, coarse, found[1])))
-    # The scatter of one machine is what two would explain: all that is compared is given scatter of its own.
-    context, border = joint.situation, found[1]
+    # The scatter of a one-machine fit includes errors that two machines would explain, so each alternative is compared
+    # with its own scatter.
+    context, border = joint.context, found[1]
     another = event_block(context, samples.average, of_row, border)
-    wandering = [*time_blocks(context, samples.average, fine=True), drift_block(context, samples.average, of_row)]
+    drifting = [*time_blocks(context, samples.average, fine=True), drift_block(context, samples.average, of_row)]
     evidence = max(found[0], background_log_bayes_factor(problem, joint, [another]))
-    if evidence < background_log_bayes_factor(problem, joint, wandering) + ODDS:
+    if evidence < background_log_bayes_factor(problem, joint, drifting) + ODDS:
         return None
     before = int((values <= border).sum())
     return Break(variable, border, before, len(values) - before, evidence)
 
 
 def _between_neighbours(values: Floats, coarse: Floats, border: float) -> Floats:
-    """Return all borders between values (m,) from the coarse border before one to that after it."""
+    """Return all borders between distinct values (m,) from the coarse border before `border` to the one after it."""
     at = int(np.searchsorted(coarse, border))
     first, last = coarse[max(at - 1, 0)], coarse[min(at + 1, len(coarse) - 1)]
     distinct = np.unique(values)
@@ -72,7 +73,7 @@ def _between_neighbours(values: Floats, coarse: Floats, border: float) -> Floats
 
 
 def _two_machines(projection: Projection, values: Floats, each: Floats) -> list[tuple[float, float]]:
-    """Return log Bayes factor and border of two machines for every one of some borders between values (m,)."""
+    """Return (log Bayes factor of two machines, border) for each of the borders `each` between values (m,)."""
     slice_of = np.searchsorted(each, values)
     kinematics = projection.kinematics[:, : projection.jacobian.shape[2]]
     index = [rows_of(np.flatnonzero(slice_of == number)) for number in range(len(each) + 1)]

@@ -1,9 +1,9 @@
-"""Causes that the library lacks, and that effects of it imitate: a drift, an event, and links that give way to loads.
+"""Causes outside the library that effects of the library imitate: a drift, an event, and compliant links.
 
-What happens at one instant has one cause: where the library lacks it, steps of something else at that instant imitate
-it, each beyond doubt. So do steps at any instants of what changes steadily. Likewise a link that gives way in a way of
-its own is imitated by others. Such effects are not named where a cause of that kind, whatever it is in particular,
-explains everything without them.
+Changes at one instant have one cause. If the library lacks this cause, several step effects at the same instant can
+imitate it, each with strong evidence. Steps at several instants can likewise imitate a steady drift, and compliances of
+other links can imitate a link that deflects in an unknown way. Such effects are not named if a general cause of this
+kind explains the data without them.
 """
 
 from __future__ import annotations
@@ -19,32 +19,38 @@ from calibration.effects.fitted import Choice
 from calibration.effects.library import library
 from calibration.effects.timing import StepFamily
 from calibration.gap.background.blocks import Block, drift_block, elastic_blocks, event_blocks
-from calibration.gap.background.naming import Names, names_beside
-from calibration.gap.background.outside import grammar_beside
-from calibration.gap.background.search import ODDS_OF_TWO, grown, joint_beside, linear_system, system_beside
+from calibration.gap.background.naming import Names, names_given_background
+from calibration.gap.background.outside import grammar_of_residuals
+from calibration.gap.background.search import (
+    ODDS_OF_TWO,
+    add_certain_effects,
+    kinematics_given_effects,
+    linear_system,
+    system_given_effects,
+)
 from calibration.gap.background.widening import further_blocks
 from calibration.gap.detection import FAR, Detection, detect
 from calibration.gap.joint_fit import JointFit, Problem
 
-_APART = 4.0  # standard deviations of instants
-_MOST = 2  # events that may explain all
-_MORE = 15.0  # log Bayes factor of a cause against the effects that imitate it
-_ANY_SIZE = 10.0  # factor on plausible sizes
+_APART = 4.0  # standard deviations within which two instants may be the same
+_MOST = 2  # largest number of events
+_MORE = 15.0  # log Bayes factor required of a cause against the effects that imitate it
+_ANY_SIZE = 10.0  # factor on plausible sizes to allow almost any amplitude
 
 
-def names_beside_cause(
+def names_given_cause(
     problem: Problem, families: Collection[str], known: Sequence[Choice], *, is_open: bool
 ) -> Names | None:
-    """Return what is named beside an event, a drift or yielding links in general, which effects of the library imitate.
+    """Return the names given a general event, drift or link compliance that effects of the library imitate.
 
     Args:
         problem: the data.
-        families: of effects that may be named.
-        known: effects that were found without it.
-        is_open: they leave more than noise.
+        families: families of effects that may be named.
+        known: effects that were found without such a cause.
+        is_open: True if these effects leave more than noise.
 
     Returns:
-        None where no effect imitates such a cause, or where more is left.
+        The names; None if no effect imitates such a cause, or if the cause leaves more than noise.
     """
     steps = [choice for choice in known if _is_step(choice)]
     if steps and (is_open or _coincide(steps)):
@@ -53,9 +59,9 @@ def names_beside_cause(
             names = _names(problem, families, known, imitating, cause)
             if names is not None:
                 return _without_parts(problem, names)
-    yielding = [choice for choice in known if library()[choice.family].goes_with]
-    if yielding and is_open:
-        cause, imitating = _links(problem, known, yielding)
+    compliant = [choice for choice in known if library()[choice.family].load_kind]
+    if compliant and is_open:
+        cause, imitating = _links(problem, known, compliant)
         if _explains_more(problem, cause, families, known, imitating):
             return _names(problem, families, known, imitating, cause)
     return None
@@ -68,30 +74,30 @@ def _names(
     imitating: Sequence[Choice],
     cause: Sequence[Block],
 ) -> Names | None:
-    """Return the names beside a cause in place of what imitates it; None where nothing does, or more is left."""
+    """Return the names given a cause that replaces its imitations; None without imitations or if structure remains."""
     others = [choice for choice in known if choice not in imitating]
     if not imitating or _left(problem, problem.fit(others, problem.solution.fit.x), cause).p < FAR:
         return None
-    names = names_beside(problem, cause, families, others)
+    names = names_given_background(problem, cause, families, others)
     return None if _left(problem, names.joint, cause).significant else names
 
 
 def _left(problem: Problem, joint: JointFit, blocks: Sequence[Block]) -> Detection:
-    """Test whether more than noise is left when blocks are fitted along with kinematics and effects."""
+    """Test for structure in the residuals when blocks are fitted together with kinematics and effects."""
     columns = joined([block.columns for block in blocks], len(problem.solution.samples))
     columns = replace(columns, prior_sigma=_ANY_SIZE * columns.prior_sigma)
-    return detect(grammar_beside(problem, joint, columns), problem.rng())
+    return detect(grammar_of_residuals(problem, joint, columns), problem.rng())
 
 
 class _Evidence:
-    """Log evidence of some of the known effects beside some blocks, by weights that count beside all of them."""
+    """Log evidence of subsets of known effects and blocks, with the outlier weights of the full model."""
 
     def __init__(self, problem: Problem, known: Sequence[Choice], blocks: Sequence[Block]) -> None:
-        self._system, effects, _ = system_beside(problem, blocks, known)
+        self._system, effects, _ = system_given_effects(problem, blocks, known)
         self._effects = dict(zip(map(str, known), effects, strict=True))
 
     def of(self, choices: Sequence[Choice], without: Collection[Block] = ()) -> float:
-        """Return the log evidence of effects beside all blocks but some."""
+        """Return the log evidence of effects together with all blocks except those in `without`."""
         effects = [self._effects[str(choice)] for choice in choices]
         return self._system.fit(effects, None, without={block.name for block in without}).log_evidence
 
@@ -99,8 +105,8 @@ class _Evidence:
 def _drift(
     problem: Problem, known: Sequence[Choice], steps: Sequence[Choice]
 ) -> tuple[Sequence[Block], Sequence[Choice]]:
-    """Return the drift that the errors ask for in place of steps, and the steps that it makes superfluous."""
-    context = problem.kinematics_only().situation
+    """Return the drift, if the data prefer it to steps, and the steps that it makes superfluous."""
+    context = problem.kinematics_only().context
     drift = drift_block(context, problem.solution.samples.average, context.extra("time_s"))
     evidence = _Evidence(problem, known, [drift])
     whole = evidence.of(known)
@@ -113,13 +119,13 @@ def _drift(
 def _event(
     problem: Problem, known: Sequence[Choice], steps: Sequence[Choice]
 ) -> tuple[Sequence[Block], Sequence[Choice]]:
-    """Return the events that the errors ask for in place of steps, and the steps that are parts of them."""
+    """Return the events that the data require, and the steps that these events replace."""
     kinematics, average = problem.with_mild_outliers(problem.kinematics_only()), problem.solution.samples.average
     others = [choice for choice in known if choice not in steps]
-    system, begun = linear_system(problem, kinematics, (), (), others)
+    system, initial = linear_system(problem, kinematics, (), (), others)
     instants_s = [step.settings["time_s"] for step in steps]
-    model = system.fit(system.chosen(begun), None)
-    events = further_blocks(system, model, lambda: event_blocks(kinematics.situation, average, instants_s))
+    model = system.fit(system.chosen(initial), None)
+    events = further_blocks(system, model, lambda: event_blocks(kinematics.context, average, instants_s))
     if len(events) > _MOST:
         return (), ()
     parts = {event.name: [step for step in steps if _is_part(step, [event])] for event in events}
@@ -135,17 +141,17 @@ def _event(
 
 
 def _links(
-    problem: Problem, known: Sequence[Choice], yielding: Sequence[Choice]
+    problem: Problem, known: Sequence[Choice], compliant: Sequence[Choice]
 ) -> tuple[Sequence[Block], Sequence[Choice]]:
-    """Return links that give way to loads, and the effects of loads for which any of the other links does as well.
+    """Return blocks of compliant links, and the load effects that they make superfluous.
 
-    The links at the places of effects that are there in their own right are left out: they could do the same.
+    The links at the places of the other load effects are left out, as they could imitate those effects.
     """
-    links = elastic_blocks(problem.kinematics_only().situation, problem.solution.samples.average)
+    links = elastic_blocks(problem.kinematics_only().context, problem.solution.samples.average)
     if not links:
         return (), ()
     evidence, imitating, alike = _Evidence(problem, known, links), list[Choice](), set[str]()
-    for choice in yielding:
+    for choice in compliant:
         own = [
             link
             for link in links
@@ -166,23 +172,22 @@ def _explains_more(
     known: Sequence[Choice],
     imitating: Sequence[Choice],
 ) -> bool:
-    """True if a cause is plainly more probable than what imitates it along with all that the library has beside that.
+    """Return True if a cause is clearly more probable than its imitations with any further effects of the library.
 
-    Links that give way in general can do whatever effects of loads do, also where the library has all of these: they
-    are not asked for then.
+    General link compliance can represent all load effects. It is not needed if the library has all of those present.
     """
     if not imitating:
         return False
-    joint, scales = joint_beside(problem, cause, known)
+    joint, scales = kinematics_given_effects(problem, cause, known)
     others = [choice for choice in known if choice not in imitating]
-    beside, effects = linear_system(problem, joint, cause, (), others)
-    alone, begun = linear_system(problem, joint, (), families, known)
-    of_library = grown(alone, alone.fit(alone.chosen(begun), None))
-    return beside.fit(beside.chosen(effects), scales).log_evidence - of_library.log_evidence > _MORE
+    given, effects = linear_system(problem, joint, cause, (), others)
+    alone, initial = linear_system(problem, joint, (), families, known)
+    of_library = add_certain_effects(alone, alone.fit(alone.chosen(initial), None))
+    return given.fit(given.chosen(effects), scales).log_evidence - of_library.log_evidence > _MORE
 
 
 def _without_parts(problem: Problem, names: Names) -> Names:
-    """Return names without the steps at whose instant more has happened."""
+    """Return the names without steps that belong to an event."""
     parts = [step for step in names.joint.choices if _is_part(step, names.events)]
     if not parts:
         return names
@@ -192,13 +197,13 @@ def _without_parts(problem: Problem, names: Names) -> Names:
 
 
 def _coincide(steps: Sequence[Choice]) -> bool:
-    """Return True if several steps may have happened at the same time."""
+    """Return True if two steps may have happened at the same instant."""
     every = sorted((step.settings["time_s"], step.settings["time_error_s"]) for step in steps)
     return any(later - at <= _APART * math.hypot(a, b) for (at, a), (later, b) in itertools.pairwise(every))
 
 
 def _is_part(choice: Choice, events: Sequence[Block]) -> bool:
-    """Return True for a step that may have happened at the instant of an event."""
+    """Return True if an effect is a step that may have happened at the instant of an event."""
     if not _is_step(choice):
         return False
     apart = _APART * choice.settings["time_error_s"]

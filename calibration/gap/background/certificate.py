@@ -1,10 +1,10 @@
-"""Certificates: an effect that one half of the groups chooses is tested on the other half.
+"""Certificates: an effect that one half of the data selects is tested on the other half.
 
-The search looks at all data, so its evidence is not a test. Here the data are split by groups: one half chooses the
-effect of greatest evidence given all others, and where that is the named one, the other half gives the F-test of it,
-exact for normal errors and whatever the number of rows, with kinematics and background at their priors as part of the
-error. Both halves take both roles; the p-value is corrected for that, and over all names for false discoveries
-(Benjamini and Hochberg 1995). Sample splitting: Cox, Biometrika 62, 1975.
+The search uses all data, so its evidence is not an independent test. Here the data are split by groups. One half
+selects the effect of greatest evidence given all others. If this is the named effect, the other half tests it with an
+F-test, which is exact for normal errors and any number of rows, with kinematics and background at their priors as part
+of the error. Both halves take both roles, and the p-value is corrected for that. The p-values of all names are then
+adjusted for the false discovery rate (Benjamini and Hochberg 1995). Sample splitting: Cox, Biometrika 62, 1975.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from calibration.observations import Floats
 
 
 def certificates(system: System, model: Model, places: Sequence[set[str]], seed: int) -> Floats:
-    """Return (e,) the p-value of every effect of a model; 1 where no half chooses it.
+    """Return the p-value (e,) of every effect of a model; 1 where neither half selects it.
 
     Args:
         system: the linear model.
-        model: with e effects.
-        places: where each may be: which of these a half chooses is all the same.
-        seed: of the halves.
+        model: a model with e effects.
+        places: possible places of each effect; selecting any of them counts as selecting the effect.
+        seed: random seed of the split.
     """
     labels, group = np.unique(system.projection.groups, return_inverse=True)
     first = np.isin(group, np.random.default_rng([seed, 3]).permutation(len(labels))[: len(labels) // 2])
@@ -43,14 +43,14 @@ def certificates(system: System, model: Model, places: Sequence[set[str]], seed:
 
 
 def _f_test(system: System, model: Model, effect: Chosen) -> float:
-    """Return the p-value of an effect in addition to a model, for rows that had no part in choosing it."""
+    """Return the p-value of adding an effect to a model, for rows that were not used to select it."""
     squares, columns, total = system.explained(model, effect)
     rest = system.products.rows - columns
     return float(fdtrc(columns, rest, (squares / columns) / ((total - squares) / rest)))
 
 
 def _adjusted(p: Floats) -> Floats:
-    """Return p-values (e,) adjusted for the rate of false discoveries among all of them."""
+    """Return p-values (e,) adjusted for the false discovery rate."""
     order = np.argsort(p)
     ranked = p[order] * len(p) / np.arange(1, len(p) + 1)
     out = np.empty_like(p)

@@ -1,8 +1,8 @@
-"""Evidence of a linear normal model in closed form, from products of its columns alone, and its greatest scales.
+"""Closed-form evidence of a linear normal model from products of its columns, and its maximisation over scales.
 
-y = C c + noise with c normal: the log evidence and its derivative by the scale of every block of columns, and by that
-of the noise, need C'C, C'y and y'y only (Tipping, JMLR 1, 2001). So hundreds of models are compared at a cost that
-does not depend on the number of rows.
+For y = C c + noise with normal c, the log evidence and its derivatives by the scale of every block of columns and of
+the noise need only C'C, C'y and y'y (Tipping, JMLR 1, 2001). Hundreds of models can therefore be compared at a cost
+that does not depend on the number of rows.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from calibration.observations import Floats
 
 Integers = NDArray[np.intp]
 
-_LOG_SCALE = (-9.0, 5.0)  # of plausible sizes
+_LOG_SCALE = (-9.0, 5.0)  # limits of the log scale of a block, relative to plausible sizes
 _ITERATIONS = 60
-_LEAST_INFORMATION = 0.5  # about the log of a scale: that of the prior knowledge that it is plausible
-_MOST_NOISE = 12.0  # log of its variance, of the one that rows are whitened with
+_LEAST_INFORMATION = 0.5  # information about a log scale from the prior knowledge that it is plausible
+_MOST_NOISE = 12.0  # limit of the log noise variance, relative to that used for whitening
 
 
 @dataclass(frozen=True)
@@ -31,11 +31,11 @@ class Products:
     """Products of whitened columns.
 
     Attributes:
-        gram: (t, t) of all columns with each other, in prior sigmas.
-        along: (t,) with the target.
-        squares: of the target.
+        gram: (t, t) products of all columns, in prior sigmas.
+        along: (t,) products of the columns with the target.
+        squares: sum of squares of the target.
         rows: number of rows.
-        least_noise: least variance of the noise, of the one that rows are whitened with.
+        least_noise: smallest noise variance, relative to that used for whitening.
     """
 
     gram: Floats
@@ -47,15 +47,15 @@ class Products:
 
 @dataclass(frozen=True)
 class Scales:
-    """Scales of greatest evidence.
+    """Scales of maximum evidence.
 
     Attributes:
-        fixed: (f,) columns whose scales stay.
-        fixed_sigma: (f,) those scales.
-        blocks: name -> its columns.
-        log_scale: name -> log of the factor on its prior sigmas.
-        noise: variance of the noise, of the one that rows are whitened with.
-        log_evidence: of the model, up to a constant of the rows.
+        fixed: (f,) indices of the columns whose scales are fixed.
+        fixed_sigma: (f,) scales of these columns.
+        blocks: block name -> indices of its columns.
+        log_scale: block name -> log of the factor on its prior sigmas.
+        noise: variance of the noise, relative to that used for whitening.
+        log_evidence: log evidence of the model, up to a constant that depends only on the rows.
     """
 
     fixed: Integers
@@ -67,7 +67,7 @@ class Scales:
 
     @property
     def index(self) -> Integers:
-        """(q,) all columns of the model."""
+        """(q,) indices of all columns of the model."""
         return np.concatenate([self.fixed, *self.blocks.values()]).astype(np.intp)
 
     @property
@@ -84,11 +84,11 @@ class Scales:
 
 
 def posterior_factor(gram: Floats) -> Floats:
-    """Return the lower Cholesky factor of columns' products (q, q) in units of the noise, with the prior of each."""
+    """Return the lower Cholesky factor of the posterior precision, from products (q, q) in units of noise and prior."""
     return np.asarray(cholesky(gram + np.eye(len(gram)), lower=True), dtype=np.float64)
 
 
-def greatest(
+def maximise_evidence(
     products: Products,
     fixed: Integers,
     fixed_sigma: Floats,
@@ -97,16 +97,16 @@ def greatest(
     noise: float,
     enough: float,
 ) -> Scales:
-    """Return the scales of blocks and noise that have the greatest evidence.
+    """Return the scales of blocks and noise that maximise the evidence.
 
     Args:
-        products: of the whitened columns.
-        fixed: (f,) columns whose scales stay.
-        fixed_sigma: (f,) those scales.
-        blocks: name -> its columns.
-        start: name -> log scale to start from.
-        noise: to start from.
-        enough: of log evidence, by which another step has to better it.
+        products: products of the whitened columns.
+        fixed: (f,) indices of the columns whose scales are fixed.
+        fixed_sigma: (f,) scales of these columns.
+        blocks: block name -> indices of its columns.
+        start: block name -> initial log scale.
+        noise: initial noise variance.
+        enough: tolerance: iterations stop when a step improves the log evidence by less.
     """
     names = list(blocks)
     index = np.concatenate([np.empty(0, dtype=np.intp), *blocks.values()]).astype(np.intp)
@@ -116,7 +116,7 @@ def greatest(
     low = np.append(np.full(len(names), _LOG_SCALE[0]), least)
     high = np.append(np.full(len(names), _LOG_SCALE[1]), _MOST_NOISE)
     theta = np.append([start[name] for name in names], float(np.log(noise))).clip(low, high)
-    # In the axes and units of the information all directions are alike, and a few steps are enough.
+    # Whitening the parameters with the Fisher information makes all directions equal, so that few steps are enough.
     information = model.information(np.exp(theta[number]), float(np.exp(theta[-1])), number)
     information[np.diag_indices_from(information)] += _LEAST_INFORMATION
     turned = np.linalg.inv(np.linalg.cholesky(information)).T
@@ -128,7 +128,7 @@ def greatest(
         slope = np.append(np.bincount(number, slope, minlength=len(names)), by_noise)
         return -value, -(turned.T @ np.where(at == inside, slope, 0.0))
 
-    # SciPy's tolerance is relative to a value of many thousands; differences of a few are what counts.
+    # SciPy's tolerance is relative to a value of many thousands, but differences of a few units matter.
     begin = np.zeros(len(theta))
     at_begin = negative(begin)
 
@@ -148,16 +148,16 @@ def greatest(
 
 
 class FixedAndScaled:
-    """Log evidence as a function of the scales of some columns, beside others whose scales stay.
+    """Log evidence as a function of the scales of some columns, with the scales of the others fixed.
 
-    In the axes of their own products the columns that stay are independent of each other at any noise: they are
-    eliminated once and for all, and what is factored again and again has the columns with scales alone.
+    In the eigenvectors of their products, the fixed columns are independent of each other at any noise. They are
+    eliminated once, and only a matrix of the scaled columns is factored in each evaluation.
 
     Args:
-        products: of the whole.
-        fixed: (f,) columns whose scales stay.
-        fixed_sigma: (f,) those scales.
-        index: (b,) columns with scales.
+        products: products of all columns.
+        fixed: (f,) indices of the columns whose scales are fixed.
+        fixed_sigma: (f,) scales of these columns.
+        index: (b,) indices of the columns with variable scales.
     """
 
     def __init__(self, products: Products, fixed: Integers, fixed_sigma: Floats, index: Integers) -> None:
@@ -171,16 +171,16 @@ class FixedAndScaled:
         self._products = products
 
     def information(self, sigma: Floats, noise: float, number: Integers) -> Floats:
-        """Return Fisher's information (s + 1, s + 1) about the logs of the scales of s blocks and of the noise.
+        """Return the Fisher information (s + 1, s + 1) about the logs of the scales of s blocks and of the noise.
 
-        What the columns that stay take of the noise is left out: it is used to choose axes only.
+        The degrees of freedom of the fixed columns are neglected, as the result is used only to choose axes.
 
         Args:
             sigma: (b,) scales.
-            noise: variance.
-            number: (b,) of the block of each column, in order.
+            noise: noise variance.
+            number: (b,) number of each column's block, in rising order.
         """
-        known = np.eye(len(sigma)) - inverse_by(self._beside_fixed(sigma, noise)[2])
+        known = np.eye(len(sigma)) - inverse_by(self._eliminate_fixed(sigma, noise)[2])
         first = np.flatnonzero(np.diff(number, prepend=-1))
         squares = np.add.reduceat(np.add.reduceat(known**2, first, axis=0), first, axis=1)
         kept = np.diag(known) - (known**2).sum(axis=0)
@@ -189,14 +189,14 @@ class FixedAndScaled:
         return np.block([[2.0 * squares, with_noise[:, None]], [with_noise, np.array([0.5 * of_noise])]])
 
     def evidence(self, sigma: Floats, noise: float) -> tuple[float, Floats, float]:
-        """Return the log evidence, its derivatives by the log of every scale (b,), and by that of the noise.
+        """Return the log evidence, and its derivatives by the log of every scale (b,) and by the log of the noise.
 
         Args:
             sigma: (b,) scales.
-            noise: variance.
+            noise: noise variance.
         """
         products, size = self._products, self._size
-        left, across, factor = self._beside_fixed(sigma, noise)
+        left, across, factor = self._eliminate_fixed(sigma, noise)
         fixed = self._along_fixed * np.sqrt(left / noise)
         score = sigma * (self._along - across.T @ fixed) / noise
         root = inverse_root_by(factor)
@@ -207,32 +207,33 @@ class FixedAndScaled:
         value -= float(np.log(np.diag(factor)).sum()) - 0.5 * float(np.log(left).sum())
         variance = np.einsum("ij,ij->j", root, root)
         slope: Floats = mean**2 + variance - 1.0
-        # Of what stays: posterior means in prior sigmas, and variances with what the others leave open.
+        # Fixed columns: posterior means in prior sigmas, and variances including the uncertainty of the scaled columns.
         mean_fixed = np.sqrt(left / noise) * (fixed - across @ (sigma * mean))
         open_to_others = (blas.dtrmm(1.0, root, (across * sigma).T, lower=1) ** 2).sum(axis=0) / noise
         of_fixed = float(left.sum()) + float(open_to_others @ left)
-        # The squares that the posterior mean leaves, over the noise.
+        # Sum of squares of the residuals of the posterior mean, divided by the noise.
         squares = products.squares / noise - explained - float(mean @ mean) - float(mean_fixed @ mean_fixed)
         count = len(size) + len(sigma)
         return value, slope, 0.5 * (squares + count - float(variance.sum()) - of_fixed - products.rows)
 
-    def _beside_fixed(self, sigma: Floats, noise: float) -> tuple[Floats, Floats, Floats]:
-        """Return what the columns that stay leave of the others.
+    def _eliminate_fixed(self, sigma: Floats, noise: float) -> tuple[Floats, Floats, Floats]:
+        """Eliminate the fixed columns.
 
         Args:
             sigma: (b,) scales.
-            noise: variance.
+            noise: noise variance.
 
         Returns:
-            (f,) the share of the prior variance that is left along the axes of what stays; (f, b) products of these
-            axes with the others; the Cholesky factor (b, b) of the others' posterior precision, in prior sigmas.
+            The remaining share (f,) of the prior variance along the axes of the fixed columns; products (f, b) of these
+            axes with the scaled columns; the Cholesky factor (b, b) of the scaled columns' posterior precision, in
+            prior sigmas.
         """
         left = noise / (noise + self._size)
         across = self._across * np.sqrt(left / noise)[:, None]
         matrix = (self._gram - across.T @ across) * (sigma * sigma[:, None] / noise)
         matrix[np.diag_indices_from(matrix)] += 1.0
         factor, failed = lapack.dpotrf(matrix, lower=1)
-        if failed:  # of data without noise the difference is all rounding, and no eigenvalue is less than one
+        if failed:  # for data without noise the difference is only rounding error; all true eigenvalues are at least 1
             size, axes = np.linalg.eigh(matrix)
             factor = np.linalg.cholesky(axes * np.maximum(size, 1.0) @ axes.T)
         return left, across, factor

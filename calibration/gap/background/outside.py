@@ -1,4 +1,4 @@
-"""Formulas of effects outside the library: parts of a background where they do not explain everything."""
+"""Formulas of effects outside the library, as blocks of a background."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ from calibration.gap.projection import Projection
 from calibration.identification.refinement import refine
 from calibration.observations import Floats
 
-MOST_FORMULAS = 3  # that may explain all that is left
-_SAME = 0.995  # share of a formula's squares that an effect which is the same explains
+MOST_FORMULAS = 3  # largest number of formulas to explain the residuals
+_SAME = 0.995  # an effect is equivalent to a formula if it explains this share of the formula's squares
 
 
 def formula_block(formula: Formula, number: int) -> Block:
-    """Return the block of a formula; its prior sigma is its size."""
+    """Return the block of a formula; the prior sigma is the size of its coefficient."""
     return Block(f"formula{number}", "formula", formula.term.source.where, str(formula.term), _columns([formula]))
 
 
 def is_in_library(formula: Formula, candidates: Sequence[CandidateEffect], over: Projection) -> bool:
-    """True if a formula is an effect of the library in other words.
+    """Return True if a formula is equivalent to an effect of the library.
 
     Args:
-        formula: of the grammar.
+        formula: a formula of the grammar.
         candidates: effects of the library.
         over: the projection in which they are compared.
     """
@@ -47,20 +47,29 @@ def is_in_library(formula: Formula, candidates: Sequence[CandidateEffect], over:
     return False
 
 
-def what_is_left(problem: Problem, joint: JointFit, formulas: Sequence[Formula]) -> tuple[Formula, ...]:
-    """Return the formula of what is left when formulas are fitted along with kinematics and effects, if anything is.
+def residual_formula(problem: Problem, joint: JointFit, formulas: Sequence[Formula]) -> tuple[Formula, ...]:
+    """Return the best formula of the residuals when formulas are fitted together with kinematics and effects.
 
     Args:
         problem: the data.
         joint: kinematics and effects.
-        formulas: any number.
+        formulas: formulas to include in the fit.
+
+    Returns:
+        One formula, or empty if only noise is left.
     """
-    grammar = grammar_beside(problem, joint, _columns(formulas) if formulas else None)
+    grammar = grammar_of_residuals(problem, joint, _columns(formulas) if formulas else None)
     return grammar.find(1) if detect(grammar, problem.rng()).significant else ()
 
 
-def grammar_beside(problem: Problem, joint: JointFit, additions: EffectColumns | None) -> Grammar:
-    """Return the grammar of what is left when further columns are fitted along with kinematics and effects."""
+def grammar_of_residuals(problem: Problem, joint: JointFit, additions: EffectColumns | None) -> Grammar:
+    """Return the grammar of the residuals when further columns are fitted together with kinematics and effects.
+
+    Args:
+        problem: the data.
+        joint: kinematics and effects.
+        additions: further columns; None for none.
+    """
     solution, explained = problem.solution, problem
     if additions is not None:
         chain = solution.chain
@@ -70,9 +79,15 @@ def grammar_beside(problem: Problem, joint: JointFit, additions: EffectColumns |
 
 
 def formulas_suffice(problem: Problem, joint: JointFit, formulas: tuple[Formula, ...]) -> bool:
-    """True if a few formulas more explain all that effects leave, be they effects of the library in words or not."""
+    """Return True if a few further formulas, equivalent to library effects or not, explain all residual structure.
+
+    Args:
+        problem: the data.
+        joint: kinematics and effects.
+        formulas: formulas found before.
+    """
     for _ in range(MOST_FORMULAS):
-        further = what_is_left(problem, joint, formulas)
+        further = residual_formula(problem, joint, formulas)
         if not further:
             return True
         formulas += further
@@ -80,18 +95,18 @@ def formulas_suffice(problem: Problem, joint: JointFit, formulas: tuple[Formula,
 
 
 def cost_with_formulas(problem: Problem, joint: JointFit, formulas: tuple[Formula, ...]) -> float:
-    """Return the cost of effects together with the formulas that explain what they leave, nats.
+    """Return the cost of effects together with the formulas of their residuals, nats.
 
     Args:
         problem: the data.
         joint: kinematics and effects.
-        formulas: those that count already; a few more are added.
+        formulas: formulas found before; a few more are added.
     """
     return _cost(problem, joint, _blocks(problem, joint, formulas))
 
 
 def formulas_log_bayes_factor(problem: Problem, joint: JointFit, formulas: tuple[Formula, ...]) -> float:
-    """Return the log Bayes factor of formulas beside effects, by the scatter of the fit or by what they leave of it.
+    """Return the log Bayes factor of formulas given effects, the larger of two: with fixed and with refitted scatter.
 
     Arguments are those of `cost_with_formulas`.
     """
@@ -102,7 +117,7 @@ def formulas_log_bayes_factor(problem: Problem, joint: JointFit, formulas: tuple
 
 def _blocks(problem: Problem, joint: JointFit, formulas: tuple[Formula, ...]) -> list[Block]:
     for _ in range(MOST_FORMULAS):
-        formulas += what_is_left(problem, joint, formulas)
+        formulas += residual_formula(problem, joint, formulas)
     return [formula_block(formula, number) for number, formula in enumerate(formulas)]
 
 

@@ -1,8 +1,8 @@
-"""Random errors of readings, as several prisms of one standstill show them: these errors they share.
+"""Random errors of readings, estimated from the prisms of the same standstill, which share these errors.
 
-A rig file that has encoders better than they are, or readings taken before the machine stood still, make errors that
-differ from pose to pose and go together at all prisms of a pose. Taken for noise of the fixes they count as evidence
-once for every prism.
+If the rig file is too optimistic about the encoders, or if readings are taken before the machine stands still, errors
+differ from pose to pose and are correlated between all prisms of a pose. If they were treated as noise of the fixes,
+they would count as evidence once for every prism.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ from calibration.gap.joint_fit import Problem
 from calibration.observations import Floats
 
 _LEAST_PAIRS = 60
-_LARGER = 1.5  # times the rig file's variance
+_LARGER = 1.5  # ratio to the rig file's variance from which on the variance is increased
 
 
 def with_reading_noise(problem: Problem, system: System, model: Model) -> Problem:
-    """Return the data with the reading errors that samples of one standstill share, where these exceed the rig file's.
+    """Return the problem with increased reading noise, where errors shared within standstills exceed the rig file's.
 
     Args:
         problem: the data.
-        system: a linear model of them.
-        model: what is known to be there.
+        system: a linear model of the data.
+        model: the effects and background found.
     """
     rig, solution = problem.solution.chain.rig, problem.solution
     shared = _shared_variance(system, model)
@@ -44,10 +44,10 @@ def with_reading_noise(problem: Problem, system: System, model: Model) -> Proble
 
 
 def _shared_variance(system: System, model: Model) -> Floats:
-    """Return (joints,) variances of reading errors that samples of one standstill share, deg^2 or mm^2.
+    """Return the variances (joints,) of reading errors that samples of one standstill share, deg^2 or mm^2.
 
-    The products of errors of two samples are, in the mean, the sum over joints of the variance times both samples'
-    displacements; least squares finds variances that are not negative.
+    The expected product of the errors of two samples is the sum over joints of the variance times the displacements of
+    both samples. The variances are found by nonnegative least squares.
     """
     projection = system.projection
     samples = projection.samples
@@ -66,7 +66,7 @@ def _shared_variance(system: System, model: Model) -> Floats:
     of_second = np.einsum("pcj,pck->pjk", moved[second], moved[second])
     along = np.einsum("pcj,pc->pj", moved[first], left[first]) * np.einsum("pcj,pc->pj", moved[second], left[second])
     unit = np.sqrt(np.einsum("pjj,pjj->j", of_first, of_second))
-    is_shared = unit > 0.0  # one that moves only either of two arms is in no product
+    is_shared = unit > 0.0  # a joint that moves only one of two arms appears in no product
     unit = unit[is_shared]
     matrix = np.einsum("pjk,pjk->jk", of_first, of_second)[np.ix_(is_shared, is_shared)] / (unit * unit[:, None])
     variance = np.zeros(count)
@@ -75,5 +75,5 @@ def _shared_variance(system: System, model: Model) -> Floats:
 
 
 def _ends(labels: np.ndarray) -> np.ndarray:
-    """Return where the sorted labels (m,) change."""
+    """Return the indices at which the sorted labels (m,) change."""
     return np.flatnonzero(np.diff(np.sort(labels))) + 1

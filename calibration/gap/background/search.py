@@ -1,4 +1,4 @@
-"""The search for effects beside a background: the one of greatest gain is added until none is beyond doubt."""
+"""Search for effects given a background: the effect of greatest gain is added until none is certain."""
 
 from __future__ import annotations
 
@@ -19,25 +19,25 @@ from calibration.gap.candidates import CandidateEffect, candidate_at, candidate_
 from calibration.gap.joint_fit import JointFit, Problem
 from calibration.gap.screening import ScoredEffect
 
-MAP = "joint_error_map"  # the curves of the background are this effect
-ODDS = math.log(999.0)  # of an effect against none
-ODDS_OF_TWO = math.log(19.0)  # of one effect against another that is as likely beforehand
-_LIKE_A_CURVE = 0.02  # share of the variance that a curve may leave
-_TRIED = 6  # candidates whose gain is found with scales of their own
-_MOST = 60  # effects
+MAP = "joint_error_map"  # the effect that corresponds to curves of the background
+ODDS = math.log(999.0)  # log odds required of an effect against none
+ODDS_OF_TWO = math.log(19.0)  # log odds required of one effect against another that is equally probable a priori
+_LIKE_A_CURVE = 0.02  # a candidate is like a curve if the curve leaves at most this share of its variance
+_TRIED = 6  # number of candidates whose gain is computed with refitted scales
+_MOST = 60  # largest number of effects
 _PASSES = 4
 
 
 @dataclass(frozen=True)
 class Gain:
-    """A candidate, and what a model gains by it.
+    """A candidate, and the gain of a model by it.
 
     Attributes:
         scored: the candidate.
-        log_bayes_factor: against the model without it, all scales of the background found again.
-        log_likelihood_gain: the same of its best form and size, as if these had been known beforehand.
+        log_bayes_factor: log Bayes factor against the model without it, with all scales of the background refitted.
+        log_likelihood_gain: the same for the best variant and scale only, without averaging over variants and scales.
         log_odds: `log_bayes_factor` with prior odds.
-        model: with it.
+        model: the model with the candidate.
     """
 
     scored: ScoredEffect
@@ -47,7 +47,7 @@ class Gain:
     model: Model
 
 
-def search_beside(
+def search_given_background(
     problem: Problem,
     joint: JointFit,
     blocks: Sequence[Block],
@@ -55,28 +55,28 @@ def search_beside(
     known: Sequence[Choice],
     possible: PossibleBlocks | None = None,
 ) -> tuple[System, Model]:
-    """Return the linear model with all effects that are beyond doubt beside a background.
+    """Return the linear model with all effects that are certain given a background.
 
-    Outliers and scatter are judged again beside what was found, and the search goes on from there. An effect takes on
-    what others explain that are not found yet, so its estimate may be beyond its hard limits until they are: the
-    judgement of effects looks at limits, not the search.
+    Outlier weights and scatter are updated given the effects found, and the search continues from there. An effect
+    absorbs errors of others that are not found yet, so its estimate may exceed its hard limits for a while. Therefore
+    limits are not checked in the search but in the later assessment of effects.
 
     Args:
         problem: the data.
-        joint: the kinematics alone, with weights to begin with.
-        blocks: of the background.
-        families: of effects that may be named.
-        known: effects to begin with.
-        possible: yields blocks to widen the background by where the errors ask for them; None for none.
+        joint: the kinematics alone, with initial weights.
+        blocks: blocks of the background.
+        families: families of effects that may be named.
+        known: initial effects.
+        possible: function that yields further blocks to add where the residuals require them; None for none.
     """
     scales: Scales | None = None
     found: tuple[Effect, ...] = ()
     for number in range(_PASSES):
         fit, scales = reweighted(problem, joint, blocks, found, scales)
         joint = replace(joint, fit=fit)
-        system, begun = linear_system(problem, joint, blocks, families, known)
-        effects = found if number else begun
-        model = grown(system, system.fit(system.chosen(effects), scales), any_size=True)
+        system, initial = linear_system(problem, joint, blocks, families, known)
+        effects = found if number else initial
+        model = add_certain_effects(system, system.fit(system.chosen(effects), scales), any_size=True)
         found = tuple((system.candidates[n], option, scale) for n, option, scale in model.effects)
         scales = model.scales
         further = further_blocks(system, model, possible) if possible else ()
@@ -87,39 +87,41 @@ def search_beside(
 
 
 def background_log_bayes_factor(problem: Problem, joint: JointFit, blocks: Sequence[Block]) -> float:
-    """Return the log Bayes factor of a background beside kinematics and effects, against noise alone.
+    """Return the log Bayes factor of a background against noise alone, given kinematics and effects.
 
     Args:
         problem: the data.
         joint: kinematics and effects.
-        blocks: of the background.
+        blocks: blocks of the background.
     """
-    system, effects, scales = system_beside(problem, blocks, joint.choices)
+    system, effects, scales = system_given_effects(problem, blocks, joint.choices)
     return system.background_log_bayes_factor(system.fit(effects, scales))
 
 
-def system_beside(
+def system_given_effects(
     problem: Problem, blocks: Sequence[Block], known: Sequence[Choice]
 ) -> tuple[System, list[Chosen], Scales]:
-    """Return the linear model with known effects beside a background, by weights that count beside all of these.
+    """Return the linear model with known effects and a background, with the outlier weights given all of these.
 
     Args:
         problem: the data.
-        blocks: of the background.
-        known: effects.
+        blocks: blocks of the background.
+        known: the effects.
 
     Returns:
-        The model, the effects in it, in their order, and the scales of the background beside them.
+        The linear model, the effects in it in the same order, and the scales of the background given them.
     """
-    joint, scales = joint_beside(problem, blocks, known)
+    joint, scales = kinematics_given_effects(problem, blocks, known)
     system, effects = linear_system(problem, joint, blocks, (), known)
     return system, system.chosen(effects), scales
 
 
-def joint_beside(problem: Problem, blocks: Sequence[Block], known: Sequence[Choice]) -> tuple[JointFit, Scales]:
-    """Return the kinematics alone by weights that count beside known effects and a background, and its scales.
+def kinematics_given_effects(
+    problem: Problem, blocks: Sequence[Block], known: Sequence[Choice]
+) -> tuple[JointFit, Scales]:
+    """Return the kinematics alone with the outlier weights given known effects and a background, and its scales.
 
-    Arguments are those of `system_beside`.
+    Arguments are those of `system_given_effects`.
     """
     kinematics = problem.with_mild_outliers(problem.kinematics_only())
     _, effects = linear_system(problem, kinematics, (), (), known)
@@ -130,27 +132,27 @@ def joint_beside(problem: Problem, blocks: Sequence[Block], known: Sequence[Choi
 def linear_system(
     problem: Problem, joint: JointFit, blocks: Sequence[Block], families: Collection[str], known: Sequence[Choice]
 ) -> tuple[System, tuple[Effect, ...]]:
-    """Return the linear model about a fit, and the known effects in it.
+    """Return the linear model at a fit, and the known effects in it.
 
     Args:
         problem: the data.
-        joint: the kinematics alone, with weights and scatter that count.
-        blocks: of a background.
-        families: of the candidates; new maps of joints are the background's.
-        known: effects that are candidates in any case, in the form that they are known in.
+        joint: the kinematics alone, with the weights and scatter to use.
+        blocks: blocks of a background.
+        families: families of the candidates, without joint error maps, which the background represents.
+        known: effects that are always candidates, in their known variants.
     """
-    projection, context = problem.project(joint), joint.situation
-    begun = [candidate_at(context, projection, c.family, c.where, [replace(c, scale=1.0)]) for c in known]
+    projection, context = problem.project(joint), joint.context
+    initial = [candidate_at(context, projection, c.family, c.where, [replace(c, scale=1.0)]) for c in known]
     every = candidate_effects(context, projection, [name for name in families if name != MAP]).candidates
-    taken = {block.where for block in blocks if block.kind == "formula"}  # what is outside the library is there
+    taken = {block.where for block in blocks if block.kind == "formula"}  # places of effects outside the library
     possible = [candidate for candidate in every if candidate.where not in taken]
     noise = projection.samples.variance(context.rig, projection.joint_jacobian)
-    system = System(projection, blocks, _joined(possible, begun), noise / (noise + joint.fit.excess_variance))
-    return system, tuple((own, 0, c.scale) for own, c in zip(begun, known, strict=True))
+    system = System(projection, blocks, _joined(possible, initial), noise / (noise + joint.fit.excess_variance))
+    return system, tuple((own, 0, c.scale) for own, c in zip(initial, known, strict=True))
 
 
 def _joined(possible: Sequence[CandidateEffect], known: Sequence[CandidateEffect]) -> list[CandidateEffect]:
-    """Return the possible candidates, those that are known with the form that they are known in as their first."""
+    """Return the possible candidates; known ones get their known variant as the first option."""
     by_name = {str(c): c for c in known}
     out = []
     for candidate in possible:
@@ -169,17 +171,17 @@ def gains(
     later: Collection[str] = (),
     any_size: bool = False,
 ) -> list[Gain]:
-    """Return what a model gains by the candidates that promise most, the greatest first.
+    """Return the gains of a model by the most promising candidates, greatest first.
 
     Args:
         system: the linear model.
-        model: what is there.
-        later: families whose turn has not come.
-        any_size: candidates whose estimates are beyond their hard limits are among them.
+        model: the present model.
+        later: families to skip for now.
+        any_size: True to include candidates whose estimates exceed their hard limits.
     """
     every = system.screen(model).score()
     possible = [w for w in promising(system, model, every, any_size=any_size) if w.candidate.family not in later]
-    # What is small beside the model stays so beside a further effect, and half of all columns may be of that.
+    # Blocks that are negligible given the model stay so given a further effect. They may be half of all columns.
     small = system.negligible_blocks(model)
     found = [gain(system, model, w, model.scales, small) for w in possible[:_TRIED]]
     return sorted(found, key=lambda g: -g.log_odds)
@@ -188,27 +190,27 @@ def gains(
 def promising(
     system: System, model: Model, scored: Sequence[ScoredEffect], *, any_size: bool = False
 ) -> list[ScoredEffect]:
-    """Return the scored candidates that speak for themselves, the most probable first.
+    """Return the scored candidates with a positive log Bayes factor, the most probable first.
 
     Args:
         system: the linear model.
-        model: beside which they were scored.
-        scored: candidates.
-        any_size: those whose estimates are beyond their hard limits are among them.
+        model: the model given which they were scored.
+        scored: the candidates.
+        any_size: True to include candidates whose estimates exceed their hard limits.
     """
     possible = [w for w in scored if w.log_bayes_factor > 0.0 and (any_size or not is_beyond_limits(system, model, w))]
     return sorted(possible, key=lambda w: -w.log_bayes_factor - log_prior(system, model, w.candidate))
 
 
 def gain(system: System, model: Model, scored: ScoredEffect, start: Scales, without: Collection[str] = ()) -> Gain:
-    """Return what a model gains by a candidate, all scales of the background found again.
+    """Return the gain of a model by a candidate, with all scales of the background refitted.
 
     Args:
         system: the linear model.
-        model: without the candidate.
+        model: the model without the candidate.
         scored: the candidate.
-        start: scales to start from.
-        without: names of blocks that the model is to do without.
+        start: initial scales.
+        without: names of blocks to leave out.
     """
     tried = system.fit([*model.effects, system.choice(scored)], start, without=without, quick=True)
     best = tried.log_evidence - model.log_evidence
@@ -217,15 +219,15 @@ def gain(system: System, model: Model, scored: ScoredEffect, start: Scales, with
 
 
 def temper(system: System, model: Model, candidate: CandidateEffect, log_bayes_factor: float) -> float:
-    """Return the factor by which variances are larger, and log odds less, than a model says.
+    """Return the tempering factor by which variances are multiplied and log odds divided.
 
-    A machine does not do quite what the equation of an effect says, and a background fits it imperfectly: evidence that
-    is larger than the part that may differ can count is true to a share of it only. How imperfect it all is shows in
-    the noise, as far as station and readings do not account for that.
+    A machine deviates from the equation of an effect, and a background fits this deviation imperfectly. Very large
+    evidence is therefore trusted only in part. The degree of imperfection is estimated from the noise that station and
+    readings do not explain.
 
     Args:
         system: the linear model.
-        model: beside which the evidence was taken.
+        model: the model given which the evidence was computed.
         candidate: the effect.
         log_bayes_factor: the evidence.
     """
@@ -235,15 +237,26 @@ def temper(system: System, model: Model, candidate: CandidateEffect, log_bayes_f
 
 
 def is_beyond_limits(system: System, model: Model, scored: ScoredEffect) -> bool:
-    """True if an estimate is beyond its hard limits by more than chance and an imperfect background account for."""
+    """Return True if an estimate exceeds its hard limits by more than chance and an imperfect background explain.
+
+    Args:
+        system: the linear model.
+        model: the model given which the candidate was scored.
+        scored: the candidate.
+    """
     error = scored.standard_error * math.sqrt(temper(system, model, scored.candidate, scored.log_bayes_factor))
-    return bool(scored.choice.beyond(system.projection.situation, scored.estimate, error))
+    return bool(scored.choice.beyond_limits(system.projection.context, scored.estimate, error))
 
 
 def log_prior(system: System, model: Model, candidate: CandidateEffect) -> float:
-    """Return the log prior probability of a candidate; families that a model has share half of it all.
+    """Return the log prior probability of a candidate; families already in the model share a probability of one half.
 
-    One that the curve of its own joint can imitate has that curve for its alternative, and not nothing.
+    If the curve of its own joint can imitate the candidate, its alternative is that curve instead of no effect.
+
+    Args:
+        system: the linear model.
+        model: the model to which the candidate is added.
+        candidate: the candidate.
     """
     if is_curve(system, candidate):
         return -math.log(sum(c.where == candidate.where and is_curve(system, c) for c in system.candidates))
@@ -257,7 +270,7 @@ def log_prior(system: System, model: Model, candidate: CandidateEffect) -> float
 
 
 def is_curve(system: System, candidate: CandidateEffect) -> bool:
-    """True if the background's curve of the same joint can do what a candidate does in these data."""
+    """Return True if the background's curve of the same joint can represent a candidate in these data."""
     curve = next((b for b in system.blocks.values() if b.kind == "curve" and b.where == candidate.where), None)
     own = candidate.additions[0]
     if curve is None or own.shift_mm is not None or candidate.family == MAP:
@@ -269,28 +282,33 @@ def is_curve(system: System, candidate: CandidateEffect) -> bool:
 
 
 def needed(system: System, model: Model, candidate: CandidateEffect) -> float:
-    """Return the log odds that a candidate needs in addition to a model.
+    """Return the log odds that a candidate needs to be added to a model.
 
-    They are those against nothing for a new family; less is enough for a further place of a family that is there, and
+    A new family needs the odds against no effect. Less is required for a further place of a family in the model, and
     against an anonymous curve of the joint.
+
+    Args:
+        system: the linear model.
+        model: the model without the candidate.
+        candidate: the candidate.
     """
     there = any(system.candidates[number].family == candidate.family for number, _, _ in model.effects)
     return ODDS_OF_TWO if there or is_curve(system, candidate) else ODDS
 
 
-def grown(system: System, model: Model, *, any_size: bool = False) -> Model:
-    """Return a model with the effect of the greatest gain added until none is beyond doubt.
+def add_certain_effects(system: System, model: Model, *, any_size: bool = False) -> Model:
+    """Return a model to which the effect of greatest gain is added repeatedly until none is certain.
 
-    One coefficient of an effect that comes after another can stand for several of that one, and would be taken for it:
-    it has its turn when none of the others is beyond doubt any more.
+    A secondary effect (`Family.secondary_to`) can replace several effects of a primary family with one coefficient, and
+    would be found instead of them. It is therefore considered only when no other effect is certain.
 
     Args:
         system: the linear model.
-        model: what is there.
-        any_size: effects whose estimates are beyond their hard limits are added too.
+        model: the present model.
+        any_size: True to add also effects whose estimates exceed their hard limits.
     """
     families = {c.family for c in system.candidates}
-    for later in ({name for name in families if families & set(library()[name].comes_after)}, set[str]()):
+    for later in ({name for name in families if families & set(library()[name].secondary_to)}, set[str]()):
         while len(model.effects) < _MOST:
             every = gains(system, model, later=later, any_size=any_size)
             found = [g for g in every if g.log_odds > needed(system, model, g.scored.candidate)]

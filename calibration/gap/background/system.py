@@ -1,4 +1,4 @@
-"""Kinematics, background and candidate effects as one linear model about a fit, judged by products of its columns."""
+"""Kinematics, background and candidate effects as one linear model at a fit, evaluated by products of its columns."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from scipy.linalg import cho_solve, solve_triangular
 
 from calibration.effects.columns import EffectColumns
 from calibration.gap.background.blocks import Block
-from calibration.gap.background.evidence import Products, Scales, greatest, posterior_factor
+from calibration.gap.background.evidence import Products, Scales, maximise_evidence, posterior_factor
 from calibration.gap.candidates import CandidateEffect
 from calibration.gap.projection import Projection
 from calibration.gap.screening import ScoredEffect, Screen
@@ -25,21 +25,21 @@ Integers = NDArray[np.intp]
 Chosen = tuple[int, int, float]  # number of a candidate, its variant, scale of plausible sizes
 Effect = tuple[CandidateEffect, int, float]
 
-_ENOUGH, _NEARLY = 0.01, 0.1  # of a log evidence; differences of several are what counts
-_START, _AGAIN = -1.0, -3.0  # log scale of a block at the beginning, and of one that had vanished
-_AT_ONCE = 3000  # rows
-_GONE = -5.0  # log scale of a block that has vanished
-_NEGLIGIBLE = 0.01  # nats, at most, of information that the data have about a block
-_SEEN = 1e-10  # least eigenvalue of products of columns, of their largest
+_ENOUGH, _NEARLY = 0.01, 0.1  # tolerances of a log evidence; only differences of several units matter
+_START, _AGAIN = -1.0, -3.0  # initial log scale of a block, and of a block that had vanished
+_AT_ONCE = 3000  # rows per batch
+_GONE = -5.0  # log scale below which a block has vanished
+_NEGLIGIBLE = 0.01  # information of the data about a block below which it is negligible, nats
+_SEEN = 1e-10  # smallest eigenvalue of products of columns that counts, relative to the largest
 
 
 @dataclass(frozen=True)
 class Model:
-    """A model of the system: which effects it has, and how large its background is.
+    """A model of the system: its effects, and the scales of its background.
 
     Attributes:
-        effects: (candidate, variant, scale) of each.
-        scales: of background and noise.
+        effects: (candidate, variant, scale) of each effect.
+        scales: scales of background and noise.
     """
 
     effects: tuple[Chosen, ...]
@@ -47,27 +47,27 @@ class Model:
 
     @property
     def log_evidence(self) -> float:
-        """Log evidence, up to a constant of the rows."""
+        """Log evidence, up to a constant that depends only on the rows."""
         return self.scales.log_evidence
 
     def without(self, number: int) -> tuple[Chosen, ...]:
-        """Return the effects without one of them."""
+        """Return the effects without the one of this number."""
         return self.effects[:number] + self.effects[number + 1 :]
 
 
 class System:
-    """A linear model about a fit.
+    """A linear model at a fit.
 
     Args:
-        projection: about the fit; its kinematics are those of the model.
-        blocks: of the background.
+        projection: projection at the fit; its kinematics are those of the model.
+        blocks: blocks of the background.
         candidates: effects that may be part of the model.
-        least_noise: least variance of the noise, of the one that the projection whitens with.
+        least_noise: smallest noise variance, relative to that used for whitening.
 
     Attributes:
         projection, candidates: as above.
         blocks: name -> block of the background.
-        products: of all whitened columns, in prior sigmas.
+        products: products of all whitened columns, in prior sigmas.
     """
 
     def __init__(
@@ -106,7 +106,7 @@ class System:
         return self.projection.whitened(self.projection.moved_mm(additions)) * additions.prior_sigma
 
     def of_rows(self, rows: Integers) -> System:
-        """Return the same system of some of the whitened rows (r,) alone: their products, and no columns."""
+        """Return the same system for some of the whitened rows (r,) only: their products, without columns."""
         out = copy(self)
         out.columns = self.columns[:0]
         gram, along = np.zeros_like(self.products.gram), np.zeros_like(self.products.along)
@@ -120,11 +120,11 @@ class System:
         return out
 
     def chosen(self, effects: Sequence[Effect]) -> list[Chosen]:
-        """Return effects by the numbers of their candidates."""
+        """Return effects with candidates given by number."""
         return [(self._number[str(candidate)], option, scale) for candidate, option, scale in effects]
 
     def choice(self, scored: ScoredEffect) -> Chosen:
-        """Return a scored candidate in its best variant."""
+        """Return a scored candidate in its best variant and scale."""
         return self._number[str(scored.candidate)], scored.option, scored.scale
 
     def fit(
@@ -135,13 +135,13 @@ class System:
         without: Collection[str] = (),
         quick: bool = False,
     ) -> Model:
-        """Return the model with the given effects and the background of greatest evidence.
+        """Return the model with the given effects and the background of maximum evidence.
 
         Args:
-            effects: (candidate, variant, scale) of each.
-            start: scales to start from; plausible ones by default.
-            without: names of blocks that are left out.
-            quick: near enough to compare models, without blocks that have vanished.
+            effects: (candidate, variant, scale) of each effect.
+            start: initial scales; plausible ones by default.
+            without: names of blocks to leave out.
+            quick: True for a looser tolerance that suffices to compare models, and without blocks that have vanished.
         """
         log_scale = dict.fromkeys(self._of_block, _START if start is None else _AGAIN)
         log_scale |= {} if start is None else start.log_scale
@@ -152,11 +152,11 @@ class System:
         }
         fixed, sigma = self._fixed(effects)
         noise = 1.0 if start is None else start.noise
-        scales = greatest(self.products, fixed, sigma, blocks, log_scale, noise, _NEARLY if quick else _ENOUGH)
+        scales = maximise_evidence(self.products, fixed, sigma, blocks, log_scale, noise, _NEARLY if quick else _ENOUGH)
         return Model(tuple(effects), scales)
 
     def negligible_blocks(self, model: Model) -> frozenset[str]:
-        """Return the names of the blocks that are so small in a model that the data tell next to nothing of them."""
+        """Return the names of blocks so small in a model that the data have almost no information about them."""
         factor, diagonal = 0.5 / model.scales.noise, np.diag(self.products.gram)
         return frozenset(
             name
@@ -167,17 +167,17 @@ class System:
     def background_log_bayes_factor(self, model: Model) -> float:
         """Return the log Bayes factor of a model's background against noise alone.
 
-        Its scales are those of greatest evidence, so that it is a few above zero where there is nothing.
+        The scales maximise the evidence, so the result is slightly above zero even without any structure.
         """
         return model.log_evidence - self.fit(model.effects, None, without=self.blocks).log_evidence
 
     def at(self, effects: Sequence[Chosen], scales: Scales) -> Model:
-        """Return the model with the given effects at scales as they are."""
+        """Return the model with the given effects at unchanged scales."""
         fixed, sigma = self._fixed(effects)
         return Model(tuple(effects), replace(scales, fixed=fixed, fixed_sigma=sigma))
 
     def _fixed(self, effects: Sequence[Chosen]) -> tuple[Integers, Floats]:
-        """Return the columns (f,) of kinematics and effects, and the factors (f,) on their sigmas."""
+        """Return the indices (f,) of the columns of kinematics and effects, and the factors (f,) on their sigmas."""
         index, sigma = [self._kinematics], [np.ones(len(self._kinematics))]
         for number, option, scale in effects:
             own = self.candidates[number]
@@ -187,7 +187,7 @@ class System:
         return np.concatenate(index).astype(np.intp), np.concatenate(sigma)
 
     def amounts(self, model: Model) -> Floats:
-        """Return (t,) the posterior means of all columns' amounts, in prior sigmas; 0 of what a model lacks."""
+        """Return the posterior means (t,) of the amplitudes of all columns, in prior sigmas; 0 if not in the model."""
         index, weight = model.scales.index, model.scales.weight
         factor = posterior_factor(self.products.gram[np.ix_(index, index)] * (weight * weight[:, None]))
         out = np.zeros(len(self.products.along))
@@ -195,20 +195,20 @@ class System:
         return out
 
     def residual(self, model: Model) -> Floats:
-        """Return (3 m,) what a model's posterior mean leaves of the whitened target."""
+        """Return the whitened residuals (3 m,) of a model's posterior mean."""
         left: Floats = self.projection.target - self.columns @ self.amounts(model)
         return left
 
     def of_block(self, name: str) -> Integers:
-        """Return the columns of a block."""
+        """Return the indices of the columns of a block."""
         return self._of_block[name]
 
     def of_effect(self, effect: Chosen) -> Integers:
-        """Return the columns of an effect."""
+        """Return the indices of the columns of an effect."""
         return self._of_option[effect[0], effect[1]]
 
     def screen(self, model: Model) -> Screen:
-        """Return a screen of the candidates that a model lacks, beside the model."""
+        """Return a screen of the candidates that a model lacks, given the model."""
         there = {number for number, _, _ in model.effects}
         numbers = [number for number in range(len(self.candidates)) if number not in there]
         candidates = [self.candidates[number] for number in numbers]
@@ -218,22 +218,22 @@ class System:
             for option, first in enumerate(self.candidates[number].first_equal)
             if first == option
         ]
-        return Screen(self.projection, candidates, _BesideModel(self, model, distinct))
+        return Screen(self.projection, candidates, _GivenModel(self, model, distinct))
 
     def explained(self, model: Model, effect: Chosen) -> tuple[float, int, float]:
-        """Return the squares of what a model leaves that an effect explains at most, its columns, and all squares.
+        """Return the largest part of a model's residual squares that an effect explains, its rank, and all squares.
 
-        Where the model is true these are chi-square distributed times the noise that the model has wrong.
+        If the model is true, both sums of squares are chi-square distributed, up to the error of the model's noise.
         """
-        own = _BesideModel(self, model, [effect[:2]])
+        own = _GivenModel(self, model, [effect[:2]])
         size, axes = np.linalg.eigh(own.product(0, 0))
         seen = size > _SEEN * max(float(size[-1]), _SEEN)
         squares = float(((axes.T @ own.along(0))[seen] ** 2 / size[seen]).sum())
         return squares, int(seen.sum()), own.squares
 
 
-class _BesideModel:
-    """Products of the columns of variants with everything in a model projected out, as `Screen` takes them."""
+class _GivenModel:
+    """Products of the columns of variants with a model projected out, in the form that `Screen` requires."""
 
     def __init__(self, system: System, model: Model, variants: Sequence[tuple[int, int]]) -> None:
         index, weight, root = model.scales.index, model.scales.weight, math.sqrt(model.scales.noise)

@@ -1,4 +1,4 @@
-"""Outliers and scatter judged beside effects and background: what these explain is neither."""
+"""Outlier weights and scatter, given effects and background."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from calibration.gap.joint_fit import JointFit, Problem
 from calibration.identification.refinement import Fit
 
 _ROUNDS = 5
-_SETTLED = 0.1  # change of a probability
-_WIDTH = 30.0  # of outliers, as in refinement
-_SHARE = (1e-3, 0.2)
+_CONVERGED = 0.1  # largest change of a weight at convergence
+_WIDTH = 30.0  # relative width of the outlier distribution, as in refinement
+_SHARE = (1e-3, 0.2)  # limits of the share of outliers
 _LEAST_EXCESS = 1e-9  # mm^2
-_LEAST = 1e-6  # weight, so that an outlier can be none again
+_LEAST = 1e-6  # smallest weight, so that an outlier can become an inlier again
 
 
 def reweighted(
@@ -30,24 +30,24 @@ def reweighted(
     effects: Sequence[Effect],
     start: Scales | None,
 ) -> tuple[Fit, Scales]:
-    """Return a fit of the kinematics with outlier weights and scatter as they are beside effects and background.
+    """Return a fit of the kinematics with outlier weights and scatter updated, given effects and background.
 
     Args:
         problem: the data.
-        joint: the kinematics alone, with the weights to begin with.
-        blocks: of the background.
-        effects: (candidate, variant, scale) of each.
-        start: scales of the background; plausible ones by default.
+        joint: the kinematics alone, with initial weights.
+        blocks: blocks of the background.
+        effects: (candidate, variant, scale) of each effect.
+        start: initial scales of the background; plausible ones by default.
 
     Returns:
-        The fit, and the background's scales.
+        The fit, and the scales of the background.
     """
     fit = replace(joint.fit, weight=np.maximum(joint.fit.weight, _LEAST))
     candidates = [candidate for candidate, _, _ in effects]
     scales = start
     for _ in range(_ROUNDS):
         projection = problem.project(replace(joint, fit=fit))
-        known = projection.samples.variance(joint.situation.rig, projection.joint_jacobian)
+        known = projection.samples.variance(joint.context.rig, projection.joint_jacobian)
         whitened_with = known + fit.excess_variance
         system = System(projection, blocks, candidates, known / whitened_with)
         model = system.fit(system.chosen(effects), scales)
@@ -60,7 +60,7 @@ def reweighted(
         excess = max(noise * whitened_with - known, _LEAST_EXCESS)
         fit = replace(fit, weight=weight, excess_variance=excess)
         scales = replace(scales, noise=1.0)
-        if moved < _SETTLED:
+        if moved < _CONVERGED:
             break
     assert scales is not None
     return fit, scales

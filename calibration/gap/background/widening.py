@@ -1,8 +1,8 @@
-"""Widening of a background: of all that pairs of joints may do to a machine, what the remaining errors ask for.
+"""Widening of a background by blocks that the residuals require, such as errors by pairs of joints.
 
-Errors of every joint by every pair of joints would be thousands of columns, and most of them are nothing. Each is held
-against what a model leaves, as an addition to it at the scale that suits it best, and those that gain most are taken
-one after another.
+Errors of every joint as functions of every pair of joints would be thousands of columns, most of them zero. Each block
+is evaluated against the residuals of a model, as an addition at its best scale, and the blocks of greatest gain are
+added one after another.
 """
 
 from __future__ import annotations
@@ -22,28 +22,28 @@ from calibration.observations import Floats
 
 PossibleBlocks = Callable[[], Iterator[Block]]
 
-_SAMPLES = 700  # to choose by
-_AT_ONCE = 500_000  # values of columns
-_COMPARED = 200  # blocks, those of the greatest gain by themselves
-_MOST = 8  # blocks at once
-_LEAST_GAIN = 15.0  # log evidence
+_SAMPLES = 700  # samples used to choose blocks
+_AT_ONCE = 500_000  # values of columns per batch
+_COMPARED = 200  # number of blocks that are compared jointly, those of greatest individual gain
+_MOST = 8  # largest number of blocks to return
+_LEAST_GAIN = 15.0  # smallest gain of log evidence
 _SQUARED_SCALES = np.exp(np.linspace(-8.0, 6.0, 15))[:, None]
 
 
 def further_blocks(system: System, model: Model, possible: PossibleBlocks) -> tuple[Block, ...]:
-    """Return blocks that a model lacks and that what it leaves asks for, the one of the greatest gain first.
+    """Return blocks to add to a model because its residuals require them, greatest gain first.
 
-    They are chosen from the `_COMPARED` that gain most by themselves.
+    They are chosen from the `_COMPARED` blocks of greatest individual gain.
 
     Args:
         system: a linear model.
-        model: with its effects and background.
-        possible: yields the blocks to choose from; those that the system has are passed over.
+        model: the model with its effects and background.
+        possible: function that yields the blocks to choose from; blocks of the system are skipped.
     """
-    beside = _InSomeRows(system, model)
+    given = _InSomeRows(system, model)
     best: list[_Addition] = []
     for some in _batches(block for block in possible() if block.name not in system.blocks):
-        best += beside.additions(some)
+        best += given.additions(some)
         best = sorted(best, key=lambda own: -own.gain[0])[:_COMPARED]
     chosen = list(_chosen(best))
     by_name = {block.name: block for block in possible() if block.name in chosen} if chosen else {}
@@ -54,28 +54,28 @@ class _Addition:
     """A block as an addition to a model.
 
     Args:
-        name: of the block.
-        own: (r, k) rows of its columns in prior sigmas, in units of the noise.
-        removed: (q, k) the part of these along the model: products of columns less those of what is removed from them
-            are products of what the model leaves of them.
-        gram: (k, k) products of what the model leaves of the columns.
-        along: (k,) of that with what it leaves of the target.
+        name: name of the block.
+        own: (r, k) rows of the block's columns in prior sigmas, in units of the noise.
+        removed: (q, k) components of the columns along the model. Products of columns minus products of these
+            components are products of the columns with the model projected out.
+        gram: (k, k) products of the columns with the model projected out.
+        along: (k,) products of these with the residuals of the target.
 
     Attributes:
-        gain: of log evidence at the best scale, and the square of that.
+        gain: gain of log evidence at the best scale, and the square of that scale.
     """
 
     def __init__(self, name: str, own: Floats, removed: Floats, gram: Floats, along: Floats) -> None:
         self.name, self.own, self.removed, self.gram, self.along = name, own, removed, gram, along
         self.gain = _gain(gram, along)
 
-    def beside(self, taken: _Addition, factor: Floats, left: Floats) -> _Addition:
-        """Return the same block beside another that is taken into the model.
+    def given(self, taken: _Addition, factor: Floats, left: Floats) -> _Addition:
+        """Return the same block given another block that is added to the model.
 
         Args:
-            taken: the other, of k columns.
-            factor: (k, k) Cholesky factor of its products with the prior of its amounts.
-            left: (k,) its products with the target, by that factor.
+            taken: the added block, with k columns.
+            factor: (k, k) Cholesky factor of the posterior precision of its amplitudes.
+            left: (k,) its products with the target, divided by that factor.
         """
         across = taken.own.T @ self.own - taken.removed.T @ self.removed
         gone = solve_triangular(factor, across, lower=True)
@@ -84,7 +84,7 @@ class _Addition:
 
 
 class _InSomeRows:
-    """Products of further columns beside a model, in some of its rows."""
+    """Products of further columns with a model projected out, in some of its rows."""
 
     def __init__(self, system: System, model: Model) -> None:
         self._projection, self._root = system.projection, np.sqrt(model.scales.noise)
@@ -109,7 +109,7 @@ class _InSomeRows:
 
 
 def _batches(blocks: Iterator[Block]) -> Iterator[list[Block]]:
-    """Yield blocks many at a time, displacements apart from errors of joints: both together are mostly zeros."""
+    """Yield blocks in batches, displacements separate from joint errors, as both together would be mostly zeros."""
     for _, same in groupby(blocks, lambda block: block.columns.shift_mm is None):
         some, count = list[Block](), 0
         for block in same:
@@ -123,7 +123,7 @@ def _batches(blocks: Iterator[Block]) -> Iterator[list[Block]]:
 
 
 def _chosen(possible: list[_Addition]) -> Iterator[str]:
-    """Yield the name of the block that gains most, and so on beside those; of none that gains little."""
+    """Yield the name of the block of greatest gain, then of the next given it, and so on while the gain suffices."""
     for _ in range(_MOST):
         taken = max(possible, key=lambda own: own.gain[0], default=None)
         if taken is None or taken.gain[0] < _LEAST_GAIN:
@@ -131,15 +131,15 @@ def _chosen(possible: list[_Addition]) -> Iterator[str]:
         yield taken.name
         factor = cholesky(taken.gram + np.eye(len(taken.gram)) / taken.gain[1], lower=True)
         left = solve_triangular(factor, taken.along, lower=True)
-        possible = [own.beside(taken, factor, left) for own in possible if own is not taken]
+        possible = [own.given(taken, factor, left) for own in possible if own is not taken]
 
 
 def _gain(gram: Floats, along: Floats) -> tuple[float, float]:
-    """Return the gain of log evidence by columns at their best scale, and the square of that.
+    """Return the gain of log evidence by columns at their best scale, and the square of that scale.
 
     Args:
-        gram: (k, k) products of what a model leaves of them.
-        along: (k,) of that with what it leaves of the target.
+        gram: (k, k) products of the columns with the model projected out.
+        along: (k,) products of these with the residuals of the target.
     """
     size, axes = np.linalg.eigh(gram)
     share = _SQUARED_SCALES * np.maximum(size, 0.0)
@@ -150,5 +150,5 @@ def _gain(gram: Floats, along: Floats) -> tuple[float, float]:
 
 
 def _evenly(count: int) -> np.ndarray:
-    """Return the numbers of at most so many samples as are needed to choose by, evenly among all."""
+    """Return the indices of at most `_SAMPLES` evenly spread samples."""
     return np.unique(np.linspace(0, count - 1, min(count, _SAMPLES)).astype(np.intp))

@@ -1,10 +1,10 @@
-"""Formulas for what is in no library, as the data ask for them.
+"""Formulas for errors outside the library, selected by the data.
 
-Each term is a single column in the projected space, and its evidence is that of a coefficient whose order of magnitude
-nobody knows: the mean of the closed form of `projection.from_products` over prior sigmas from one standard error up
-to what would be plain to see. Several terms are found one after the other, each in what those before it leave
-(orthogonal matching pursuit: Pati, Rezaiifar and Krishnaprasad, Asilomar 1993), from several beginnings: where an error
-has two terms, as a wave of any phase has, a third may look like both and beat each alone.
+Each term is a single column in the projected space. The order of magnitude of its coefficient is unknown, so its
+evidence is the mean of the closed form of `projection.from_products` over prior sigmas from one standard error up to
+obvious sizes. Several terms are found one after the other, each in the residuals of the preceding ones (orthogonal
+matching pursuit: Pati, Rezaiifar and Krishnaprasad, Asilomar 1993), from several starts. This is because where an error
+has two terms, such as a wave of arbitrary phase, a third term may resemble their sum and beat each of them alone.
 """
 
 from __future__ import annotations
@@ -22,28 +22,28 @@ from calibration.gap.formulas.variables import Variables
 from calibration.gap.projection import Projection, SoftProjection
 from calibration.observations import Floats
 
-_LEAST_SEEN = 1e-3  # visible share of a term's displacement, of the largest such share; less is rounding
+_LEAST_SEEN = 1e-3  # smallest visible share of a term's displacement, relative to the largest; less is rounding
 _SIZES = 4.0 ** np.arange(1, 13)  # prior sigma^2 in standard errors^2
-_KEPT = 1e7  # numbers that are kept for the next question
-_BLOCKS = 1000  # of groups, for the sums by group
+_KEPT = 1e7  # largest number of column values to cache
+_BLOCKS = 1000  # largest number of blocks of groups, for the sums by group
 _MOST = 3  # terms of a description
 _BEGINNINGS = 12
-_WORTH = math.log(99.0)  # odds for a term, to be in it
+_WORTH = math.log(99.0)  # log odds required for a term
 _NEARLY = math.log(10.0)
-_LEAST_OWN = 1e-3  # share of a term's square that those before it do not have
+_LEAST_OWN = 1e-3  # smallest share of a term's square that is orthogonal to preceding terms
 _TINY = float(np.finfo(np.float64).tiny)
 
 
 @dataclass(frozen=True)
 class Formula:
-    """A term that the data ask for.
+    """A term that the data require, with its fitted coefficient.
 
     Attributes:
-        term: which.
-        coefficient, standard_error: in the unit of `term.source.coefficient_unit(term.variable)`, all found terms
-            together.
-        log_evidence: ln of the Bayes factor against what was there before it, the odds among all terms in it.
-        column: (3 m,) what it moves in the projected space, of length 1.
+        term: the term.
+        coefficient, standard_error: from a joint fit of all found terms, in the unit of
+            `term.source.coefficient_unit(term.variable)`.
+        log_evidence: log Bayes factor against the preceding terms, including the prior odds among all terms.
+        column: (3 m,) unit column of the term in the projected space.
     """
 
     term: Term
@@ -53,11 +53,11 @@ class Formula:
     column: Floats
 
     def adds_to(self, columns: Floats, residual: Floats) -> bool:
-        """True if the data ask for the term in addition to an effect, by what the effect does not explain.
+        """Return True if the data require the term in addition to an effect.
 
         Args:
-            columns: (3 m, k) of the effect in the projected space, of one prior sigma each.
-            residual: (3 m,) there.
+            columns: (3 m, k) columns of the effect in the projected space, in prior sigmas.
+            residual: (3 m,) residuals in the projected space.
         """
         without_effect = SoftProjection(columns)
         column = without_effect(self.column)
@@ -67,15 +67,15 @@ class Formula:
 
 @dataclass(frozen=True)
 class _Path:
-    """Terms chosen one after the other.
+    """A sequence of selected terms.
 
     Attributes:
         chosen: indices of the terms.
-        evidence: log evidence of each when it was chosen.
-        odds: of the choice beforehand and for the sizes that the coefficients might have had, logarithm.
-        basis: (3 m, j) orthonormal, of the columns chosen.
-        overlap: (j, k) of all unit columns with it.
-        left: squares that are left of the residual.
+        evidence: log evidence of each term when it was selected.
+        odds: logarithm of the prior odds and of the penalty for unknown coefficients (Occam factor).
+        basis: (3 m, j) orthonormal basis of the selected columns.
+        overlap: (j, k) products of the basis with all unit columns.
+        left: remaining sum of squares of the residual.
     """
 
     chosen: tuple[int, ...]
@@ -86,24 +86,24 @@ class _Path:
     left: float
 
     def value(self, noise: float) -> float:
-        """Return the log evidence of the terms together, which may lower the noise from what it was taken for."""
+        """Return the joint log evidence of the terms; if less than `noise` is left, the noise is re-estimated."""
         if self.left > noise:
             return self.odds - 0.5 * self.left
         return self.odds - 0.5 * noise * (1.0 + math.log(max(self.left, _TINY) / noise))
 
 
 class Grammar:
-    """Terms of which formulas are made, in the projected space, and how they fit.
+    """The terms of formulas in the projected space, with their scores.
 
     Args:
-        projection: the fit.
-        possible: terms; all that may be off by default.
+        projection: projection at the fit.
+        possible: the terms; by default all terms of the grammar.
 
     Attributes:
-        projection: the same.
-        terms: (k) those that these data show and tell apart.
-        score: (k,) of each, a standard normal number if nothing is missing.
-        by_group: (blocks, k) parts of the scores by groups of samples that no fold separates.
+        projection: as above.
+        terms: the k terms that are visible in these data.
+        score: (k,) score of each term, standard normal if nothing is missing.
+        by_group: (blocks, k) contributions to the scores by blocks of sample groups.
     """
 
     def __init__(self, projection: Projection, possible: Sequence[Term] | None = None) -> None:
@@ -135,10 +135,10 @@ class Grammar:
         self._largest = np.array([term.largest_coefficient for term in self.terms]) * np.concatenate(lengths)[shown]
 
     def find(self, most: int = _MOST) -> tuple[Formula, ...]:
-        """Return the terms that the data ask for together, the strongest first; none if all may be chance.
+        """Return the terms that the data require jointly, strongest first; empty if all may be chance.
 
         Args:
-            most: terms.
+            most: largest number of terms.
         """
         residual = self.projection.residual
         squares = float(residual @ residual)
@@ -164,8 +164,8 @@ class Grammar:
         return self._fitted(max(same, key=lambda path: path.evidence[:1]))
 
     def _evidence(self, path: _Path, noise: float) -> tuple[Floats, Floats]:
-        """Return (k,) squared scores of all terms in what a path leaves, and (k,) their log evidence."""
-        # What the terms before it explain was noise to them, but is none to the next one.
+        """Return squared scores (k,) of all terms in the residuals of a path, and their log evidence (k,)."""
+        # Errors that the preceding terms explain no longer count as noise for the next term.
         scale = min(1.0, path.left / noise)
         own = 1.0 - (path.overlap**2).sum(axis=0)
         score = self.score - path.overlap.T @ (path.basis.T @ self.projection.residual)
@@ -175,7 +175,7 @@ class Grammar:
         return square, _log_bayes_factor(square) + self._prior
 
     def _extended(self, further: Sequence[tuple[_Path, int, float, float]]) -> list[_Path]:
-        """Return the paths with one more term each, which is given with its log evidence and squared score."""
+        """Return paths with one more term each; `further` has (path, term, log evidence, squared score)."""
         residual = self.projection.residual
         column = columns_of(self.projection, [self.terms[i] for _, i, _, _ in further])[1]
         for number, (path, *_) in enumerate(further):
@@ -195,7 +195,7 @@ class Grammar:
         ]
 
     def _simplest(self, evidence: Floats) -> int:
-        """Return the term of the greatest evidence (k,), or a single variable of its source with nearly as much."""
+        """Return the term of greatest evidence (k,), or a single variable of the same source with nearly as much."""
         best = int(evidence.argmax())
         source = self.terms[best].source
         if self.terms[best].kind == "single":
@@ -205,7 +205,7 @@ class Grammar:
         return max(single, key=lambda i: float(evidence[i]), default=best)
 
     def _fitted(self, path: _Path) -> tuple[Formula, ...]:
-        """Return the chosen terms with coefficients fitted together."""
+        """Return the selected terms with jointly fitted coefficients."""
         if not path.chosen:
             return ()
         terms = [self.terms[i] for i in path.chosen]
@@ -229,7 +229,7 @@ class Grammar:
 
 
 def _of_shown(columns: Floats, shown: NDArray[np.bool_]) -> Floats:
-    """Return the columns (r, k) that are shown, moved to the front in place: a copy would double hundreds of MB."""
+    """Return the visible columns of (r, k), moved to the front in place, as a copy would double hundreds of MB."""
     for to, at in enumerate(np.flatnonzero(shown).tolist()):
         if to != at:
             columns[:, to] = columns[:, at]
@@ -237,7 +237,12 @@ def _of_shown(columns: Floats, shown: NDArray[np.bool_]) -> Floats:
 
 
 def describe(found: Sequence[Formula], library: str = "not in the library") -> str:
-    """Return a formula for every source, coefficients with their units, then what the library says, a clause."""
+    """Return a formula for every source, with units of the coefficients, followed by a clause about the library.
+
+    Args:
+        found: the formulas.
+        library: the clause.
+    """
     quantities: dict[str, list[str]] = {}
     for f in found:
         unit = f.term.source.coefficient_unit(f.term.variable)
@@ -248,7 +253,7 @@ def describe(found: Sequence[Formula], library: str = "not in the library") -> s
 
 
 def _log_bayes_factor(square: Floats) -> Floats:
-    """Return (k,) log Bayes factors of terms with squared scores (k,), for sizes of any order of magnitude."""
+    """Return log Bayes factors (k,) of terms with squared scores (k,), averaged over sizes of the coefficient."""
     each = 0.5 * square[:, None] * (_SIZES / (1.0 + _SIZES)) - 0.5 * np.log1p(_SIZES)
     evidence: Floats = logsumexp(each, axis=1) - math.log(len(_SIZES))
     return evidence

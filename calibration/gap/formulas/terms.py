@@ -16,11 +16,11 @@ from calibration.observations import Floats
 
 Kind = Literal["single", "crossing", "product"]
 
-_SHARES: Mapping[Kind, float] = {"single": 0.8, "crossing": 0.1, "product": 0.1}  # of the terms' odds beforehand
-_SAME = 0.9995  # correlation of two variables that one source tells apart in no data
-_COMPARED = 1500  # samples are enough to see that
+_SHARES: Mapping[Kind, float] = {"single": 0.8, "crossing": 0.1, "product": 0.1}  # prior probabilities of the kinds
+_SAME = 0.9995  # correlation above which two variables of a source count as the same
+_COMPARED = 1500  # number of samples used to compute correlations
 _ROUNDING = 1e-9
-_AT_ONCE = 2e6  # numbers of a block of columns
+_AT_ONCE = 2e6  # values in a batch of columns
 _TINY = float(np.finfo(np.float64).tiny)
 
 
@@ -29,10 +29,10 @@ class Term:
     """A formula of one coefficient.
 
     Attributes:
-        source: what is off.
-        variable: what it is proportional to.
-        kind: a variable of the source itself, one of another joint, or two together.
-        log_prior: beforehand, among all terms.
+        source: source of the error.
+        variable: the variable that the error is proportional to.
+        kind: `single` for a variable of the source itself, `crossing` for one of a different joint, `product` for two.
+        log_prior: log prior probability among all terms.
     """
 
     source: ErrorSource
@@ -45,22 +45,22 @@ class Term:
 
     @property
     def largest_coefficient(self) -> float:
-        """Size of the coefficient beyond which the error is physically impossible in these data."""
+        """Absolute value of the coefficient beyond which the error in these data would be physically impossible."""
         if math.isinf(self.source.most):
             return math.inf
         return self.source.most / max(float(np.abs(self.variable.values).max(initial=0.0)), _TINY)
 
     @property
     def moved_mm(self) -> Floats:
-        """(m, 3) displacement of the prism per unit of the coefficient, station's frame."""
+        """(m, 3) displacement of the prism per unit of the coefficient, in the station's frame."""
         moved: Floats = self.source.moved_mm * self.variable.values[:, None]
         return moved
 
 
 def all_terms(variables: Variables) -> tuple[Term, ...]:
-    """Return the terms of all sources; of those that are alike in these data, one.
+    """Return the terms of all sources, without duplicates in these data.
 
-    Single variables share most of the odds beforehand, what happens at other joints and products the rest.
+    Single variables share most of the prior probability; variables of other joints and products share the rest.
     """
     found: list[tuple[ErrorSource, Variable, Kind]] = []
     for source in variables.sources():
@@ -81,10 +81,14 @@ def all_terms(variables: Variables) -> tuple[Term, ...]:
 
 
 def modulations(projection: Projection, source: ErrorSource) -> tuple[Term, ...]:
-    """Return an error of known pattern times each of the variables that its size may depend on.
+    """Return an error of known pattern multiplied by each of the variables that its size may depend on.
 
-    Each counts from the value at which the product shows nothing of the error itself. The size is fitted, and shrunk by
-    its prior: along the error there is always something left that follows the size.
+    Each variable is offset so that the product is orthogonal to the error itself. This is because the fitted size is
+    shrunk by its prior, so that residuals always retain a part proportional to the error.
+
+    Args:
+        projection: projection at the fit.
+        source: the error.
     """
     every = Variables(projection).conditions(source.where)
     own = [every[i] for i in _different(np.column_stack([v.values for v in every]), has_offset=True)]
@@ -96,7 +100,7 @@ def modulations(projection: Projection, source: ErrorSource) -> tuple[Term, ...]
 
 
 def _different(values: Floats, *, has_offset: bool) -> list[int]:
-    """Return columns of (m, k) that repeat none before them, nor a constant where the kinematics have one."""
+    """Return the indices of columns of (m, k) that do not repeat an earlier one, nor a constant if `has_offset`."""
     values = values[:: max(len(values) // _COMPARED, 1)]
     least = _ROUNDING * np.linalg.norm(values, axis=0)
     values = values - values.mean(axis=0) if has_offset else values
@@ -109,14 +113,19 @@ def _different(values: Floats, *, has_offset: bool) -> list[int]:
 
 
 def chunks(terms: Sequence[Term], samples: int) -> Iterator[Sequence[Term]]:
-    """Yield the terms in batches whose columns fit into the caches and the memory of a small machine."""
+    """Yield the terms in batches whose columns fit into the memory of a small computer.
+
+    Args:
+        terms: the terms.
+        samples: number of samples.
+    """
     step = max(int(_AT_ONCE) // (3 * samples), 1)
     for start in range(0, len(terms), step):
         yield terms[start : start + step]
 
 
 def columns_of(projection: Projection, terms: Sequence[Term]) -> tuple[Floats, Floats, Floats]:
-    """Return displacements (m, 3, k) of terms, mm; (3 m, k) unit columns of the projected space; (k,) their lengths."""
+    """Return displacements (m, 3, k) of terms, mm, unit columns (3 m, k) in the projected space, and lengths (k,)."""
     moved = np.stack([term.moved_mm for term in terms], axis=2)
     columns = projection.columns(moved)
     length = np.linalg.norm(columns, axis=0)

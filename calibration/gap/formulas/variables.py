@@ -1,4 +1,4 @@
-"""Sources of error and the variables that they may depend on: the words of detection and of the grammar."""
+"""Sources of error and the variables that they may depend on, as used by detection and the grammar."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from calibration.rig.signals import is_read_anyway
 Unit = Mapping[str, int]  # symbol -> power
 
 _HARMONICS = 12
-_CROSS_HARMONICS = 3  # of other joints' angles
-_LEAST_CYCLE = 0.25  # of a harmonic within the range of an angle; less of one is a parabola
-_PER_CYCLE = 3.0  # different readings for each cycle of a harmonic
+_CROSS_HARMONICS = 3  # harmonics of other joints' angles
+_LEAST_CYCLE = 0.25  # smallest part of a cycle within the range of an angle; less looks like a parabola
+_PER_CYCLE = 3.0  # required number of different readings per cycle of a harmonic
 _STEPS = 16
-_LEAST_KNOWN = 0.5  # share of the rows that have a column
-_INCIDENCE = (1, 2, 3, 6)  # harmonics; six reflectors make a prism that is seen from all round
-_FEW_SIGNALS = 4  # that products take in; each more would add a hundred terms
-_MOST_OF_FIXES = 0.01  # relative error; no instrument and no air is that far off
-_MOST_OF_LENGTHS = 0.05  # nor a structure from its drawing
+_LEAST_KNOWN = 0.5  # smallest share of rows in which a column must be known
+_INCIDENCE = (1, 2, 3, 6)  # harmonics; a 360 degree prism consists of six reflectors
+_FEW_SIGNALS = 4  # largest number of signals in products, as each would add about a hundred terms
+_MOST_OF_FIXES = 0.01  # largest relative error of fixes by instrument or atmosphere
+_MOST_OF_LENGTHS = 0.05  # largest relative error of a structure's lengths
 _NOTHING: Unit = {}
 
 
@@ -36,10 +36,10 @@ class Variable:
     """A quantity that an error may be proportional to.
 
     Attributes:
-        text: as a formula has it.
-        topic: what it is a function of, as detection lists it.
-        unit: of its values.
-        values: (m,) by sample.
+        text: the variable as written in a formula.
+        topic: the quantity that it is a function of, as listed by detection.
+        unit: unit of the values.
+        values: (m,) values for the samples.
     """
 
     text: str
@@ -48,7 +48,7 @@ class Variable:
     values: Floats
 
     def times(self, other: Variable) -> Variable:
-        """The product of two variables."""
+        """Return the product of two variables."""
         unit = {symbol: self.unit.get(symbol, 0) + other.unit.get(symbol, 0) for symbol in {**self.unit, **other.unit}}
         topic = self.topic if other.topic == self.topic else f"{self.topic} x {other.topic}"
         return Variable(f"{self.text} {other.text}", topic, unit, self.values * other.values)
@@ -56,18 +56,18 @@ class Variable:
 
 @dataclass(frozen=True)
 class ErrorSource:
-    """A quantity of the machine or its measurement that may be off.
+    """A quantity of the machine or its measurement that may have an error.
 
     Attributes:
-        where: as in every output.
-        quantity: what is off, a noun phrase.
-        unit: of its error.
-        moved_mm: (m, 3) what a unit of its error does to the prism, in the station's frame.
-        joint: the joint value, where it is one's.
-        coupled: True for the rows alone that the joint drives in addition to its own.
-        constant: text and topic of a constant error; None where that is a parameter of the kinematics.
-        own: variables of this source alone.
-        most: largest error that is physically possible, in its unit.
+        where: place of the source, as in all outputs.
+        quantity: noun phrase for the error.
+        unit: unit of the error.
+        moved_mm: (m, 3) displacement of the prism per unit of the error, in the station's frame.
+        joint: the joint, if the source is a joint's value.
+        coupled: True for the rows that the joint drives in addition to its own, without its own row.
+        constant: text and topic of a constant error; None if a constant error is a parameter of the kinematics.
+        own: variables of this source only.
+        most: largest physically possible error, in `unit`.
     """
 
     where: str
@@ -81,7 +81,7 @@ class ErrorSource:
     most: float = math.inf
 
     def coefficient_unit(self, variable: Variable) -> str:
-        """Unit of the number that a variable is multiplied by here."""
+        """Return the unit of the coefficient of a variable in a formula for this source."""
         powers = {s: self.unit.get(s, 0) - variable.unit.get(s, 0) for s in {**self.unit, **variable.unit}}
         above = " ".join(_power(s, p) for s, p in powers.items() if p > 0) or "1"
         below = [_power(s, -p) for s, p in powers.items() if p < 0]
@@ -91,21 +91,21 @@ class ErrorSource:
 
 
 class Variables:
-    """Sources of error and the variables that they may depend on, by sample.
+    """Sources of error and the variables that they may depend on, for the samples.
 
     Args:
-        projection: the fit.
-        instants_s: further times, as in `time_s`, after which an error may have jumped.
+        projection: projection at the fit.
+        instants_s: further instants, as in `time_s`, at which an error may have jumped.
     """
 
     def __init__(self, projection: Projection, instants_s: Collection[float] = ()) -> None:
-        self._samples, self._situation = projection.samples, projection.situation
+        self._samples, self._context = projection.samples, projection.context
         self._joint_jacobian = projection.joint_jacobian
-        joints = self._situation.rig.joints
+        joints = self._context.rig.joints
         self._angles = tuple(j for j in joints if j.kind == "revolute")
         self._strokes = tuple(j for j in joints if j.kind == "prismatic")
         readings = projection.samples.data.readings
-        self._reading = {name: readings[:, index] for name, index in self._situation.chain.joint_index.items()}
+        self._reading = {name: readings[:, index] for name, index in self._context.chain.joint_index.items()}
         self._slow = tuple(self._environment())
         self._signals = tuple(self._machine_signals())
         self._course = tuple(
@@ -123,37 +123,37 @@ class Variables:
         return (*self._joint_sources(), *self._boom_sources(), *self._base_sources(), *self._station_sources())
 
     def _joint_sources(self) -> Iterator[ErrorSource]:
-        situation, facing = self._situation, self._situation.facing
+        context, facing = self._context, self._context.facing
         for joint in (*self._angles, *self._strokes):
             what, turn = ("angle", math.degrees(1.0)) if joint.kind == "revolute" else ("length", 1.0)
             unit: Unit = {"rad": 1} if joint.kind == "revolute" else {"mm": 1}
-            index = situation.chain.joint_index[joint.name]
+            index = context.chain.joint_index[joint.name]
             moved = self._joint_jacobian[:, :, index] * turn
             yield ErrorSource(joint.name, f"{joint.name} {what} error", unit, moved, joint)
-            _, *others = (i for i, (_, driving) in enumerate(situation.machine.drives) if driving == index)
+            _, *others = (i for i, (_, driving) in enumerate(context.machine.drives) if driving == index)
             if others:
-                alone = situation.to_station(facing.by_drive[:, :, others].sum(axis=2, keepdims=True))[:, :, 0]
+                alone = context.to_station(facing.by_drive[:, :, others].sum(axis=2, keepdims=True))[:, :, 0]
                 moved = self._samples.average(alone) * turn
                 yield ErrorSource(
                     joint.name, f"{what} error of the row coupled to {joint.name}", unit, moved, joint, True
                 )
 
     def _boom_sources(self) -> Iterator[ErrorSource]:
-        """Yield the boom's deflections about its middle, as the tip of a beam goes down and turns, and their loads."""
-        situation, boom = self._situation, boom_in(self._situation)
+        """Yield rotations of the boom about its middle, which describe deflection and slope of a beam's tip."""
+        context, boom = self._context, boom_in(self._context)
         if boom is None or not boom.carries_prism.any():
             return
         middle_mm = 0.5 * (boom.root_mm + boom.tip_mm)
-        arm_mm = (situation.located.prism_mm - middle_mm) * boom.carries_prism[:, None]
+        arm_mm = (context.located.prism_mm - middle_mm) * boom.carries_prism[:, None]
         across = np.cross(boom.axis, boom.down)
-        moment = np.zeros((len(situation), 3))
-        if situation.rig.masses:
+        moment = np.zeros((len(context), 3))
+        if context.rig.masses:
             points_mm, newton = boom.weights
             force = (newton * boom.hanging)[:, :, None] * boom.down[:, None]
             moment = np.cross((points_mm - boom.tip_mm[:, None]) / 1e3, force).sum(axis=1)
         turns = (("twist", boom.axis), ("downward bend", across), ("sideways bend", np.cross(boom.axis, across)))
         for name, about in turns:
-            moved = situation.to_station(np.cross(about, arm_mm)[:, :, None])[:, :, 0]
+            moved = context.to_station(np.cross(about, arm_mm)[:, :, None])[:, :, 0]
             turning = (moment * about).sum(axis=1)
             loads: tuple[tuple[str, Unit, Floats], ...] = (
                 ("its moment", {"N": 1, "m": 1}, turning),
@@ -165,36 +165,36 @@ class Variables:
             yield ErrorSource("boom", f"{name} of the boom", {"rad": 1}, self._samples.average(moved), own=own)
 
     def _lengths(self) -> Iterator[Variable]:
-        """Yield the length of a boom: a beam's deflection under a load grows with it."""
-        boom = boom_in(self._situation)
+        """Yield the length of a boom, on which a beam's deflection under a load depends."""
+        boom = boom_in(self._context)
         if boom is not None:
             length = self._samples.average(boom.length_mm) / 1e3
             yield Variable("length of the boom", f"{boom.joint} extension", {"m": 1}, length)
 
     def _base_sources(self) -> Iterator[ErrorSource]:
-        """Yield motions of the whole machine on its jacks; turning about the vertical is the first joint's."""
-        situation, average = self._situation, self._samples.average
-        moved = situation.base_motion_mm(np.ones(len(situation)))
+        """Yield motions of the machine on its jacks, without rotation about the vertical, which the first joint has."""
+        context, average = self._context, self._samples.average
+        moved = context.base_motion_mm(np.ones(len(context)))
         for number, axis in enumerate("xy"):
             yield ErrorSource("base", f"base tilt about {axis}", {"rad": 1}, average(moved[:, :, number]))
         yield ErrorSource("base", "base height error", {"mm": 1}, average(moved[:, :, 2]))
-        if situation.rig.masses:
-            leaning = (moved[:, :, :2] @ situation.overturning_Nm[:, :, None])[:, :, 0]
+        if context.rig.masses:
+            leaning = (moved[:, :, :2] @ context.overturning_Nm[:, :, None])[:, :, 0]
             soft: Unit = {"rad": 1, "N": -1, "m": -1}
             yield ErrorSource("base", "base tilt", soft, average(leaning), constant=("moment of all weights", "torque"))
-        grown = situation.to_station(situation.located.prism_mm[:, :, None])[:, :, 0]
+        grown = context.to_station(context.located.prism_mm[:, :, None])[:, :, 0]
         yield ErrorSource("boom", "relative error of all lengths", _NOTHING, average(grown), most=_MOST_OF_LENGTHS)
 
     def _station_sources(self) -> Iterator[ErrorSource]:
-        situation, average = self._situation, self._samples.average
-        position, scale = average(situation.located.position_mm), "relative error of all fixes"
+        context, average = self._context, self._samples.average
+        position, scale = average(context.located.position_mm), "relative error of all fixes"
         yield ErrorSource("station", scale, _NOTHING, position, constant=("", "distance"), most=_MOST_OF_FIXES)
-        velocity = situation.velocity_mm_per_s
+        velocity = context.velocity_mm_per_s
         if velocity.any():
             yield ErrorSource("clock", "error of instants", {"s": 1}, average(velocity), constant=("", "velocity"))
-        line = situation.line_of_sight
-        for prism in situation.rig.prism_names:
-            seen = situation.rows_of_prism(prism)
+        line = context.line_of_sight
+        for prism in context.rig.prism_names:
+            seen = context.rows_of_prism(prism)
             if seen.any():
                 along = average(np.where(seen[:, None], line, 0.0))
                 below = average(np.where(seen[:, None], [0.0, 0.0, -1.0], 0.0))
@@ -205,7 +205,7 @@ class Variables:
     # -- variables ------------------------------------------------------------------------------------------------
 
     def singles(self, source: ErrorSource) -> tuple[Variable, ...]:
-        """Return single variables that the error of a source may depend on, the simplest first."""
+        """Return single variables that the error of a source may depend on, simplest first."""
         joint = source.joint
         strokes = self._extensions(source)
         around = (*self._slow, *strokes, *map(_squared, strokes))
@@ -265,33 +265,33 @@ class Variables:
 
     def _loads(self, joint: Joint) -> Iterator[Variable]:
         """Yield the direction, load and rate of a joint."""
-        name, situation = joint.name, self._situation
+        name, context = joint.name, self._context
         revolute = joint.kind == "revolute"
-        yield from self._measured(f"dir({name})", "direction", _NOTHING, situation.extra(f"{name}_dir"))
+        yield from self._measured(f"dir({name})", "direction", _NOTHING, context.extra(f"{name}_dir"))
         load = "torque" if revolute else "force"
-        if situation.greatest_torque(name) > 0.0:
-            torque = situation.torque(name)
+        if context.greatest_torque(name) > 0.0:
+            torque = context.torque(name)
             unit: Unit = {"N": 1, "m": 1} if revolute else {"N": 1}
             yield from self._measured(f"{load}({name})", load, unit, torque)
             yield from self._measured(f"|{load}({name})|", load, unit, np.abs(torque))
             yield from self._measured(f"sign({load}({name}))", load, _NOTHING, np.sign(torque))
-        rate = situation.extra(f"{name}_rate") * (math.radians(1.0) if revolute else 1.0)
+        rate = context.extra(f"{name}_rate") * (math.radians(1.0) if revolute else 1.0)
         speed: Unit = {"rad" if revolute else "mm": 1, "s": -1}
         yield from self._measured(f"rate({name})", "velocity", speed, rate)
 
     def _drags(self, joint: Joint) -> Iterator[Variable]:
         """Yield the functions of a joint's velocity that friction follows."""
         name = joint.name
-        rate = self._situation.extra(f"{name}_rate") * (math.radians(1.0) if joint.kind == "revolute" else 1.0)
+        rate = self._context.extra(f"{name}_rate") * (math.radians(1.0) if joint.kind == "revolute" else 1.0)
         speed: Unit = {"rad" if joint.kind == "revolute" else "mm": 1, "s": -1}
         yield from self._measured(f"|rate({name})|", "velocity", speed, np.abs(rate))
         yield from self._measured(f"sign(rate({name}))", "velocity", _NOTHING, np.sign(rate))
 
     def _incidences(self) -> Iterator[Variable]:
-        """Harmonics of the azimuth at which the station is seen about the z axis of each prism's frame."""
-        situation = self._situation
-        back = -(situation.rotation.transpose(0, 2, 1) @ situation.line_of_sight[:, :, None])
-        toward = (situation.facing.axes @ back)[:, :, 0]
+        """Yield harmonics of the station's azimuth about the z axis of each prism's frame."""
+        context = self._context
+        back = -(context.rotation.transpose(0, 2, 1) @ context.line_of_sight[:, :, None])
+        toward = (context.facing.axes @ back)[:, :, 0]
         azimuth = np.arctan2(toward[:, 1], toward[:, 0])
         for k in _INCIDENCE:
             multiple = f"{k} incidence" if k > 1 else "incidence"
@@ -299,8 +299,8 @@ class Variables:
             yield from self._measured(f"sin({multiple})", "incidence", _NOTHING, np.sin(k * azimuth))
 
     def _environment(self) -> Iterator[Variable]:
-        """Weather, time, rest and load."""
-        extra = self._situation.extra
+        """Yield temperature, time, dwell and payload."""
+        extra = self._context.extra
         for v in self._measured("dT", "temperature", {"K": 1}, extra("temperature_degC")):
             yield Variable(v.text, v.topic, v.unit, v.values - v.values.mean())
         for v in self._measured("t", "time", {"h": 1}, extra("time_s") / 3600.0):
@@ -311,39 +311,39 @@ class Variables:
         yield from self._measured("payload", "payload", {"kg": 1}, extra("payload_kg"))
 
     def _jumps(self, instants_s: Collection[float]) -> Iterator[Variable]:
-        """Yield a step after each of the instants."""
-        time_s = self._situation.extra("time_s")
+        """Yield a step at each of the instants."""
+        time_s = self._context.extra("time_s")
         for instant_s in sorted(instants_s):
             text = _after((instant_s - float(np.nanmin(time_s))) / 3600.0)
             yield from self._measured(text, "time", _NOTHING, np.where(time_s > instant_s, 1.0, 0.0))
 
     def _machine_signals(self) -> Iterator[Variable]:
-        """Pressures, currents and the signals of the rig file."""
-        rig = self._situation.rig
+        """Yield pressures, currents and the signals of the rig file."""
+        rig = self._context.rig
         own = own_columns(rig.joint_names)
         units = {signal.column: signal.unit for signal in (*rig.channels, *rig.signals) if signal.column not in own}
-        for column in sorted(self._situation.observations.extra):
+        for column in sorted(self._context.observations.extra):
             unit = units.get(column, column.rpartition("_")[2] if is_read_anyway(column) else None)
             if unit is not None:
                 powers = {symbol: power for symbol, power in zip(unit.split("/"), (1, -1), strict=False) if symbol}
-                yield from self._measured(column, column, powers, self._situation.extra(column))
+                yield from self._measured(column, column, powers, self._context.extra(column))
 
     def _measured(self, text: str, topic: str, unit: Unit, values: Floats) -> Iterator[Variable]:
-        """The variable of (n,) values, if most rows have it and it varies; a row without it says nothing."""
+        """Yield a variable of (n,) values if most rows have it and it varies; missing values become the mean."""
         known = np.isfinite(values)
         if len(values) and known.mean() >= _LEAST_KNOWN and np.ptp(values[known]) > 0.0:
             yield Variable(text, topic, unit, self._samples.average(np.where(known, values, values[known].mean())))
 
 
 def _shapes(joint: Joint, reading: Floats) -> tuple[Variable, ...]:
-    """A joint's own value in its simplest forms."""
+    """Return the simplest functions of a joint's own value."""
     if joint.kind == "prismatic":
         return (Variable(joint.name, "extension", {"m": 1}, reading / 1e3),)
     return (Variable(joint.name, "angle", {"rad": 1}, np.radians(reading)), *_waves(joint.name, reading, 1, "angle"))
 
 
 def _curves(joint: Joint, reading: Floats) -> tuple[Variable, ...]:
-    """Powers of a joint's own value about the middle of its range, and its higher harmonics."""
+    """Return powers of a joint's own value about the middle of its range, and its higher harmonics."""
     revolute = joint.kind == "revolute"
     topic, unit = ("angle", "rad") if revolute else ("extension", "m")
     value = np.radians(reading) if revolute else reading / 1e3
@@ -354,14 +354,14 @@ def _curves(joint: Joint, reading: Floats) -> tuple[Variable, ...]:
 
 
 def _crossing(joint: Joint, reading: Floats, most: int) -> tuple[Variable, ...]:
-    """The angle of another joint."""
+    """Return functions of the angle of a different joint."""
     topic = f"{joint.name} angle"
     linear = Variable(joint.name, topic, {"rad": 1}, np.radians(reading))
     return (linear, *_harmonics(joint, reading, most, topic))
 
 
 def _harmonics(joint: Joint, reading: Floats, most: int, topic: str) -> tuple[Variable, ...]:
-    """Cosines and sines of multiples of an angle, the first and those of which the readings show a part of a cycle."""
+    """Return cosines and sines of an angle, and of its multiples that the readings resolve."""
     turns = float(np.ptp(reading)) / 360.0
     different = len(np.unique(np.rint(reading / max(joint.resolution, joint.sigma))))
     orders = [k for k in range(2, most + 1) if k * turns >= _LEAST_CYCLE and different >= _PER_CYCLE * k * turns]
@@ -381,13 +381,13 @@ def _squared(variable: Variable) -> Variable:
 
 
 def _from_mean(variable: Variable) -> Variable:
-    """Return a variable less its mean: in a product the mean would stand for the other factor alone."""
+    """Return a variable minus its mean, as in a product the mean would represent the other factor alone."""
     mean = round(float(variable.values.mean()), 2)
     return replace(variable, text=_less(variable.text, mean), values=variable.values - mean)
 
 
 def _steps(time: Variable) -> Iterator[Variable]:
-    """Yield a step after each sixteenth of the fixes."""
+    """Yield steps that divide the fixes into sixteen equal parts."""
     for after in np.unique(np.quantile(time.values, np.arange(1, _STEPS) / _STEPS)).tolist():
         yield Variable(_after(after), time.topic, _NOTHING, np.where(time.values > after, 1.0, 0.0))
 

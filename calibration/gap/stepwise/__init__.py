@@ -1,1 +1,1 @@
-"""The search for effects step by step: one is selected and adopted by a joint refit, others give way, and again."""
+"""Stepwise search for effects: select an effect, adopt it by a joint refit, revise earlier ones, and repeat."""

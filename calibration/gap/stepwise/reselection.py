@@ -1,4 +1,4 @@
-"""Reselection: effects of a fit that others make superfluous, and better forms of the rest."""
+"""Reselection: removal of effects that others make superfluous, and better variants of the rest."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from calibration.gap.joint_fit import OUTLIER, JointFit, Problem
 from calibration.gap.projection import Projection
 from calibration.gap.screening import Screen
 
-_BETTER = 1.0  # log Bayes factor, to change the form of an adopted effect
-_AT_REST = 0.1  # nats; two fits that come to rest at one place differ by less
-_FORMS = 5  # times that the forms of adopted effects are changed, before all candidates are scored again
+_BETTER = 1.0  # log Bayes factor required to change the variant of an adopted effect
+_CONVERGED = 0.1  # nats; fits that converged to the same optimum differ by less
+_FORMS = 5  # largest number of rounds of changing variants before all candidates are scored again
 
 
 def reselect(problem: Problem, joint: JointFit, again: Sequence[Choice]) -> JointFit:
-    """Return the fit without effects that others make superfluous, and with the best forms of the rest.
+    """Return the fit without effects that others make superfluous, and with the best variants of the rest.
 
     Args:
         problem: the data.
-        joint: kinematics and effects; returned itself where nothing changes.
-        again: those of its effects to look at.
+        joint: kinematics and effects; the same object is returned if nothing changes.
+        again: the effects to reselect.
     """
     names = {str(c) for c in again}
     for _ in range(_FORMS):
@@ -38,9 +38,10 @@ def reselect(problem: Problem, joint: JointFit, again: Sequence[Choice]) -> Join
 
 
 def explain_outliers(problem: Problem, joint: JointFit) -> JointFit:
-    """Return the fit with its effects in forms that explain its outliers too, or itself where these are less likely.
+    """Return the fit with variants of its effects that also explain its outliers, or the same fit if not better.
 
-    The few fixes beyond the loads of all others are outliers to a straight line, and the only ones that show a curve.
+    For example, a few fixes at loads beyond those of all others are outliers to a linear variant, but are the only ones
+    that reveal a curve.
 
     Args:
         problem: the data.
@@ -50,14 +51,14 @@ def explain_outliers(problem: Problem, joint: JointFit) -> JointFit:
         return joint
     every = replace(joint, fit=replace(joint.fit, weight=np.ones_like(joint.fit.weight)))
     tried = reselect(problem, every, joint.choices)
-    return tried if tried is not every and tried.fit.cost < joint.fit.cost - _AT_REST else joint
+    return tried if tried is not every and tried.fit.cost < joint.fit.cost - _CONVERGED else joint
 
 
 def _reselect_once(problem: Problem, joint: JointFit, again: Sequence[Choice]) -> JointFit:
-    """Reselect each effect once, by the linear model about the fit."""
+    """Reselect each effect once, in the linear model at the fit."""
     if len(joint.choices) < 2 or not again:
         return joint
-    over = Projection(problem.solution, joint.situation, joint.fit, joint.additions)
+    over = Projection(problem.solution, joint.context, joint.fit, joint.additions)
     candidates = [_with_variants(joint, over, choice, is_open=choice in again) for choice in joint.choices]
     screen = Screen(over, candidates)
     chosen = {number: (0, choice.scale) for number, choice in enumerate(joint.choices)}
@@ -65,13 +66,13 @@ def _reselect_once(problem: Problem, joint: JointFit, again: Sequence[Choice]) -
         if choice not in again:
             continue
         others = {k: v for k, v in chosen.items() if k != number}
-        beside = screen.beside(others)
+        given = screen.given(others)
         values = {
-            one: beside.together(number, *one) + float(candidates[number].log_odds[one[0]])
+            one: given.together(number, *one) + float(candidates[number].log_odds[one[0]])
             for one in itertools.product(range(len(candidates[number].options)), {1.0, choice.scale})
         }
         best = max(values, key=values.__getitem__)
-        if values[best] < beside.log_bayes_factor:
+        if values[best] < given.log_bayes_factor:
             chosen = others
         elif values[best] > values[chosen[number]] + _BETTER:
             chosen[number] = best
@@ -87,9 +88,9 @@ def _reselect_once(problem: Problem, joint: JointFit, again: Sequence[Choice]) -
 
 
 def _with_variants(joint: JointFit, over: Projection, choice: Choice, *, is_open: bool) -> CandidateEffect:
-    """Return the candidate of an effect in its present form, and in its other variants where that is open."""
+    """Return the candidate of an effect in its present variant, and if `is_open` also in its other variants."""
     options = [replace(choice, scale=1.0)]
     if is_open:
-        variants = variants_at(joint.situation, choice.family, choice.where)
+        variants = variants_at(joint.context, choice.family, choice.where)
         options += [replace(v, regime=choice.regime) for v in variants if v.settings != choice.settings]
-    return candidate_at(joint.situation, over, choice.family, choice.where, options)
+    return candidate_at(joint.context, over, choice.family, choice.where, options)

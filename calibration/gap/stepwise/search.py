@@ -1,4 +1,4 @@
-"""One search for missing effects, step by step: screen, select, adopt by joint refit, while anything can be named."""
+"""Stepwise search for missing effects: screen, select and adopt by joint refit, as long as an effect can be named."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from calibration.effects.columns import joined
 from calibration.effects.fitted import Choice
 from calibration.gap.background.outside import formulas_suffice
 from calibration.gap.candidates import CandidateEffect, CandidateEffects, candidate_effects
-from calibration.gap.criteria import best_of_each_family, beyond_doubt
+from calibration.gap.criteria import best_of_each_family, is_certain
 from calibration.gap.detection import detect
 from calibration.gap.formulas.grammar import Formula, Grammar
 from calibration.gap.joint_fit import OUTLIER, JointFit, Problem
@@ -24,9 +24,9 @@ from calibration.gap.stepwise.reselection import explain_outliers, reselect
 from calibration.gap.stepwise.selection import Selection, select_effect
 
 _MOST_FAMILIES = 4
-_STEPS = 30  # of the loop; every place of every adopted family
-_PENDING = 3  # sets that are adopted for the time being
-MANY_OUTLIERS = 0.02  # share of gross outliers that is more than accidents
+_STEPS = 30  # largest number of iterations, enough for every place of every adopted family
+_PENDING = 3  # largest number of sets that are adopted provisionally
+MANY_OUTLIERS = 0.02  # share of gross outliers from which on they may not be accidental
 
 
 class StepwiseSearch:
@@ -34,11 +34,11 @@ class StepwiseSearch:
 
     Args:
         problem: the data.
-        families: of effects that may be named.
-        known: an effect to begin with, which stays.
+        families: families of effects that may be named.
+        known: an initial effect, which is kept.
 
     Attributes:
-        least_cost: of all fits on the way, in nats.
+        least_cost: smallest cost of all fits so far, nats.
     """
 
     def __init__(self, problem: Problem, families: Collection[str], known: EffectInRegime | None = None) -> None:
@@ -47,10 +47,10 @@ class StepwiseSearch:
         self.least_cost = math.inf
 
     def run(self) -> SearchResult:
-        """Search without gross outliers, and with all samples where there are many such.
+        """Search without gross outliers, and if there are many, again with all samples.
 
-        To kinematics alone a fix that shows an effect may look like an outlier, as such fixes are often the rare ones:
-        those after a step, or where a load has changed its side. The search whose effects leave fewer outliers counts.
+        Without the effect, fixes that reveal it may look like outliers, as such fixes are often rare: those after a
+        step, or where a load has changed its sign. The search whose effects leave fewer outliers is returned.
         """
         start = self.problem.kinematics_only()
         if self.known:
@@ -64,15 +64,15 @@ class StepwiseSearch:
         return with_all if with_all.joint.choices and self._outliers(with_all) < self._outliers(found) else found
 
     def _outliers(self, found: SearchResult) -> int:
-        """Return the number of outliers to a result."""
+        """Return the number of outliers of a result."""
         fit = found.joint.fit if found.joint.choices else self.problem.solution.fit
         return int((fit.weight < OUTLIER).sum())
 
     def _run(self, joint: JointFit) -> SearchResult:
-        """Search from a fit of kinematics and known effects, whose weights are those of the first step."""
+        """Search from a fit of kinematics and known effects, with the weights of this fit in the first step."""
         first = self.problem.with_mild_outliers(self.problem.kinematics_only()) if self.known else joint
         alone = SelectionStep(first, self.problem.project(first), (), {}, ())
-        initial = candidate_effects(first.situation, alone.projection, self.families)
+        initial = candidate_effects(first.context, alone.projection, self.families)
         self._initial = initial.candidates
         steps: list[SelectionStep] = []
         posterior: dict[str, float] = {}
@@ -95,7 +95,7 @@ class StepwiseSearch:
                 early = self._structured(joint, alone, [*steps, step], selection.formulas, posterior, initial)
                 if early is not None:
                     return early
-                # One that explains outliers as well may be better where nothing more is taken.
+                # If no effect is added, variants that also explain the outliers may be better.
                 reselected = explain_outliers(self.problem, joint)
             if reselected is not joint:
                 joint = reselected
@@ -105,7 +105,7 @@ class StepwiseSearch:
                 steps.append(step)
             if is_last or selection.joint is None:
                 break
-            # The first of a set is adopted for the time being: others may stand out in addition to it.
+            # The first effect of a set is adopted provisionally, as further effects may stand out given it.
             if is_set:
                 pending += [str(c) for c in taken]
             posterior |= {str(c): selection.posterior[c.family] for c in taken}
@@ -117,9 +117,9 @@ class StepwiseSearch:
                 early = self._structured(joint, alone, steps, (), posterior, initial)
                 if early is not None:
                     return early
-        return self._judged(joint, alone, steps, selection, posterior, pending, initial)
+        return self._conclude(joint, alone, steps, selection, posterior, pending, initial)
 
-    def _judged(
+    def _conclude(
         self,
         joint: JointFit,
         alone: SelectionStep,
@@ -129,30 +129,30 @@ class StepwiseSearch:
         pending: Sequence[str],
         candidates: CandidateEffects,
     ) -> SearchResult:
-        """Return the result of a search that has come to its end, every effect judged again given all others.
+        """Return the final result of a search, with every effect assessed again given all others.
 
         Args:
             joint: kinematics and effects.
-            alone: kinematics alone.
-            steps: in their order.
-            selection: the last one.
-            posterior: as of `conclude`.
-            pending: `family@where` of the effects that were adopted for the time being.
-            candidates: all candidates at the beginning.
+            alone: the step of the kinematics alone.
+            steps: all steps in order.
+            selection: the last selection.
+            posterior: as for `conclude`.
+            pending: `family@where` of the provisionally adopted effects.
+            candidates: all candidates at the start.
         """
         alternatives = selection.alternatives
         for name in pending:
-            joint, judged, members = self._judged_again(joint, name)
-            if judged is not None and judged.adopted:
-                steps.insert(-1, judged)
-                posterior |= {str(c): judged.posterior[c.family] for c in judged.adopted}
-            elif judged is not None and members and not alternatives:
-                steps[-1], alternatives = judged, members
+            joint, reassessed, members = self._reassessed(joint, name)
+            if reassessed is not None and reassessed.adopted:
+                steps.insert(-1, reassessed)
+                posterior |= {str(c): reassessed.posterior[c.family] for c in reassessed.adopted}
+            elif reassessed is not None and members and not alternatives:
+                steps[-1], alternatives = reassessed, members
         certain = [str(c) for c in joint.choices if str(c) not in pending and c.regime is None]
         joint, renamed = self._renamed(joint, certain)
-        for judged in renamed:
-            steps.insert(-1, judged)
-            posterior |= {str(c): judged.posterior[c.family] for c in judged.adopted}
+        for reassessed in renamed:
+            steps.insert(-1, reassessed)
+            posterior |= {str(c): reassessed.posterior[c.family] for c in reassessed.adopted}
         joint = explain_outliers(self.problem, joint)
         self.least_cost = min(self.least_cost, joint.fit.cost)
         return conclude(self.problem, joint, alone, steps, alternatives, selection.formulas, posterior, candidates)
@@ -164,7 +164,7 @@ class StepwiseSearch:
         projection: Projection,
         candidates: Sequence[CandidateEffect],
     ) -> bool:
-        """True if the candidates that a fit lacks, together with a few formulas, may explain what it leaves."""
+        """Return True if the candidates missing in a fit, with a few formulas, may explain its residuals."""
         every = Screen(projection, candidates).score()
         choices = [*joint.choices, *(scored.choice for scored in every)]
         more = joined([scored.scaled_additions for scored in every], len(projection.samples))
@@ -184,13 +184,13 @@ class StepwiseSearch:
         posterior: Mapping[str, float],
         candidates: CandidateEffects,
     ) -> SearchResult | None:
-        """Return the result where more is left than effects and formulas explain, None where they may explain it all.
+        """Return a result that needs a background, or None if effects and formulas may explain all residuals.
 
-        Names are sought beside a background then, and which effects seemed likely without one does not matter any more.
+        With such a result the stepwise search can end early, as all effects are assessed again given a background.
         Arguments are those of `conclude`.
         """
         self.least_cost = min(self.least_cost, joint.fit.cost)
-        if len(joint.choices) < 2:  # there is nothing to judge again
+        if len(joint.choices) < 2:  # there is nothing to reassess
             return None
         found = conclude(self.problem, joint, alone, steps, (), formulas, posterior, candidates)
         if found.joint.choices or formulas_suffice(self.problem, found.joint, found.strongest_formula):
@@ -198,64 +198,65 @@ class StepwiseSearch:
         return replace(found, needs_background=True)
 
     def _candidates(self, joint: JointFit) -> tuple[Projection, tuple[CandidateEffect, ...]]:
-        """Return the projection about a fit, and the candidates that may be missing in it."""
+        """Return the projection at a fit, and the candidates that may be missing in it."""
         projection = self.problem.project_with_mild_outliers(joint)
         return projection, self._still_possible(joint.choices, projection)
 
     def _still_possible(self, there: Sequence[Choice], projection: Projection) -> tuple[CandidateEffect, ...]:
-        """Return the candidates that may be added: of no other families once a model has its most."""
+        """Return the candidates that may be added; no new families once a model has the largest number of families."""
         taken = {c.family for c in there}
         allowed = [f for f in self.families if f in taken] if len(taken) >= _MOST_FAMILIES else self.families
         names = [str(c) for c in there]
-        return candidate_effects(projection.situation, projection, allowed, names, self._initial).candidates
+        return candidate_effects(projection.context, projection, allowed, names, self._initial).candidates
 
     def _reselected(self, joint: JointFit, taken: Sequence[Choice]) -> JointFit:
-        """Return the fit with its effects in their best forms, before those `taken` are added.
+        """Return the fit with its effects in their best variants, before the effects `taken` are added.
 
-        An effect may have a better form by now, all the more at the same place.
+        If effects are added, only effects at the same places are reselected.
         """
         places = {c.where for c in taken}
         return reselect(self.problem, joint, [c for c in joint.choices if not taken or c.where in places])
 
     def _renamed(self, joint: JointFit, names: Sequence[str]) -> tuple[JointFit, list[SelectionStep]]:
-        """Return the fit with other effects in place of those that were only the best before the others were known.
+        """Return the fit after replacing effects that are no longer the best given all others, and the steps for it.
 
         Args:
             joint: kinematics and effects.
-            names: `family@where` of the effects to judge again.
+            names: `family@where` of the effects to assess again.
         """
         steps: list[SelectionStep] = []
         for name in names:
             if len({c.family for c in joint.choices}) == 1:
                 break
-            if name not in map(str, joint.choices) or self._is_plain(joint, name):
+            if name not in map(str, joint.choices) or self._is_certain(joint, name):
                 continue
-            other, step, _ = self._judged_again(joint, name)
+            other, step, _ = self._reassessed(joint, name)
             if step is not None and step.adopted and name not in map(str, step.adopted):
                 joint = reselect(self.problem, other, other.choices)
                 steps.append(step)
         return joint, steps
 
-    def _is_plain(self, joint: JointFit, name: str) -> bool:
-        """True if an effect would be named again, given all others, with no alternative near."""
+    def _is_certain(self, joint: JointFit, name: str) -> bool:
+        """Return True if an effect would be named again given all others, without a near alternative."""
         joint = joint.with_last([str(c) for c in joint.choices].index(name))
         projection = self.problem.project(joint, without_last=True)
         scored = Screen(projection, self._still_possible(joint.choices[:-1], projection)).score()
-        return str(scored[0].candidate) == name and beyond_doubt(best_of_each_family(scored))
+        return str(scored[0].candidate) == name and is_certain(best_of_each_family(scored))
 
-    def _judged_again(
+    def _reassessed(
         self, joint: JointFit, name: str
     ) -> tuple[JointFit, SelectionStep | None, tuple[ScoredEffect, ...]]:
-        """Judge an effect again, now that all others are known.
+        """Assess an effect again given all others.
 
         Returns:
-            The fit with it or without, the step (None if the effect is not there), and the set that is not told apart.
+            The fit with the effect or without it, the step (None if the fit lacks the effect), and the set of effects
+            that cannot be distinguished.
         """
         if name not in map(str, joint.choices):
             return joint, None, ()
         others = [c for c in joint.choices if str(c) != name]
         without = self.problem.fit_part(joint, others)
-        # What all together explain is no outlier to a part of it.
+        # Use the weights of the full fit, as samples that all effects together explain are not outliers.
         counted = replace(without, fit=replace(without.fit, weight=joint.fit.weight))
         projection = self.problem.project_with_mild_outliers(counted)
         selection = select_effect(self.problem, without, projection, self._still_possible(others, projection))
@@ -266,6 +267,6 @@ class StepwiseSearch:
 
 
 def _step(joint: JointFit, projection: Projection, selection: Selection, taken: tuple[Choice, ...]) -> SelectionStep:
-    # Each holds its columns, and all candidates of thousands of fixes are a good part of a gigabyte.
+    # Keep only some candidates, as their columns for thousands of fixes take a large part of a gigabyte.
     scored = selection.scored[:COMPARED]
     return SelectionStep(joint, projection, scored, selection.posterior, taken, selection.reasons)

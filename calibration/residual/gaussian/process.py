@@ -36,7 +36,7 @@ _MOST_ROWS = 1500  # to find the terms by, and of a block of the sums over all r
 
 
 @dataclass(frozen=True)
-class Found:
+class CurveTerms:
     """Terms over all variables of some rows, by name and whether they go round."""
 
     variables: tuple[tuple[str, bool], ...]
@@ -62,7 +62,7 @@ class GaussianProcess:
     curves: tuple[Curve, ...]
     weights: Floats
     parameters: Floats
-    found: Found | None = field(default=None, compare=False)
+    found: CurveTerms | None = field(default=None, compare=False)
 
     @cached_property
     def _sum(self) -> CurveSum:
@@ -116,7 +116,7 @@ class GaussianProcess:
 
 
 def fit_gaussian_process(
-    features: Features, target_mm: Floats, seed: int, start: Found | None = None
+    features: Features, target_mm: Floats, seed: int, start: CurveTerms | None = None
 ) -> GaussianProcess | None:
     """Find terms, their amplitudes and smoothness, and their weights.
 
@@ -167,7 +167,7 @@ def fit_gaussian_process(
         curves,
         weights[p:],
         weights[:p] * unit,
-        Found(variables, search.terms),
+        CurveTerms(variables, search.terms),
     )
 
 

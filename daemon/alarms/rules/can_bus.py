@@ -20,7 +20,7 @@ def bus_off(evidence: Evidence) -> Iterator[Finding]:
     again.
     """
     ended_by = EventKind.BUS_ERROR_ACTIVE, EventKind.BUS_ERROR_WARNING, EventKind.BUS_ERROR_PASSIVE, EventKind.LINK_UP
-    for event in evidence.standing(EventKind.BUS_OFF, *ended_by):
+    for event in evidence.active_events(EventKind.BUS_OFF, *ended_by):
         channels = [c for c in evidence.acquisition.channels if c.link == event.device]
         is_heard = any(is_present(c.status) and (c.age_s or 0.0) < event.age_s for c in channels)
         if not is_heard and not evidence.is_cut_off(event.device):
@@ -34,7 +34,7 @@ def bus_error_passive(evidence: Evidence) -> Iterator[Finding]:
     Cleared 10 s after it says that it is not, or after the link was opened anew.
     """
     ended_by = EventKind.BUS_ERROR_ACTIVE, EventKind.BUS_ERROR_WARNING, EventKind.BUS_OFF, EventKind.LINK_UP
-    for event in evidence.standing(EventKind.BUS_ERROR_PASSIVE, *ended_by):
+    for event in evidence.active_events(EventKind.BUS_ERROR_PASSIVE, *ended_by):
         if not evidence.is_cut_off(event.device):
             yield event.device, event.text
 
@@ -46,7 +46,7 @@ def heartbeat_lost(evidence: Evidence) -> Iterator[Finding]:
     One that sends nothing at all is a joint or signal that is silent. Cleared when the heartbeat is heard again.
     """
     present = {channel.name for channel in evidence.acquisition.channels if is_present(channel.status)}
-    for event in evidence.standing(EventKind.HEARTBEAT_LOST, EventKind.HEARTBEAT_RESTORED):
+    for event in evidence.active_events(EventKind.HEARTBEAT_LOST, EventKind.HEARTBEAT_RESTORED):
         if event.device in present:
             yield event.device, event.text
 
@@ -58,7 +58,7 @@ def emergency(evidence: Evidence) -> Iterator[Finding]:
     It goes on over a restart of the daemon. Cleared when the node takes back its last error (code 0 with an error
     register of zero), or boots.
     """
-    for event in evidence.standing(EventKind.EMERGENCY, EventKind.EMERGENCY_CLEARED, EventKind.BOOT_UP):
+    for event in evidence.active_events(EventKind.EMERGENCY, EventKind.EMERGENCY_CLEARED, EventKind.BOOT_UP):
         if not evidence.is_cut_off(event.device):
             yield event.device, event.text
 
@@ -69,8 +69,8 @@ def device_alarm(evidence: Evidence) -> Iterator[Finding]:
 
     Cleared when it says that the alarm is gone, or boots; one of its set-up when it has been set up.
     """
-    set_up = {event.device for event in evidence.standing(EventKind.ALARM, EventKind.CONFIGURED)}
-    for event in evidence.standing(EventKind.ALARM, EventKind.BOOT_UP):
+    set_up = {event.device for event in evidence.active_events(EventKind.ALARM, EventKind.CONFIGURED)}
+    for event in evidence.active_events(EventKind.ALARM, EventKind.BOOT_UP):
         is_mended = event.code is None and event.device not in set_up
         if not is_mended and not evidence.is_cut_off(event.device):
             yield event.device, event.text
@@ -82,7 +82,7 @@ def device_warning(evidence: Evidence) -> Iterator[Finding]:
 
     Cleared when it does or boots; one that nothing takes back when the link is opened anew.
     """
-    for event in evidence.standing(EventKind.WARNING, EventKind.BOOT_UP):
+    for event in evidence.active_events(EventKind.WARNING, EventKind.BOOT_UP):
         link = evidence.link_of(event.device)
         is_of_before = event.code is None and link is not None and link.up is True and link.since_s < event.age_s
         if not is_of_before and not evidence.is_cut_off(event.device):

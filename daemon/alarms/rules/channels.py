@@ -107,8 +107,10 @@ def _silent(evidence: Evidence, kind: str) -> Iterator[Finding]:
 
 
 def _not_usable(evidence: Evidence, kind: str) -> Iterator[Finding]:
-    told = {event.device for event in evidence.standing(EventKind.ALARM, EventKind.BOOT_UP)}
-    told |= {e.device for e in evidence.standing(EventKind.EMERGENCY, EventKind.EMERGENCY_CLEARED, EventKind.BOOT_UP)}
+    told = {event.device for event in evidence.active_events(EventKind.ALARM, EventKind.BOOT_UP)}
+    told |= {
+        e.device for e in evidence.active_events(EventKind.EMERGENCY, EventKind.EMERGENCY_CLEARED, EventKind.BOOT_UP)
+    }
     for channel in evidence.acquisition.channels:
         if channel.status == Status.DEVICE_ALARM and channel.name in told:
             continue

@@ -20,7 +20,7 @@ BEHIND_NS = 60 * NS_PER_S
 )
 def clock_stepped(evidence: Evidence) -> Iterator[Finding]:
     """The computer's clock was set within the last 15 minutes."""
-    for event in evidence.lately(EventKind.CLOCK_STEP, STEPPED_S):
+    for event in evidence.recent_events(EventKind.CLOCK_STEP, STEPPED_S):
         yield event.device, event.text
 
 

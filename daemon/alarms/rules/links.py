@@ -61,7 +61,7 @@ def queue_full(evidence: Evidence) -> Iterator[Finding]:
 @rule("warning", "Check adapter and cable, and what else keeps the computer busy.")
 def frames_lost(evidence: Evidence) -> Iterator[Finding]:
     """The kernel, an adapter or a full queue has lost frames of a link within the last 5 minutes."""
-    for event in evidence.lately(EventKind.FRAMES_DROPPED, LATELY_S):
+    for event in evidence.recent_events(EventKind.FRAMES_DROPPED, LATELY_S):
         yield event.device, event.text
 
 
@@ -72,7 +72,7 @@ def time_doubtful(evidence: Evidence) -> Iterator[Finding]:
     The link was not read for a while, or the clock was set. They are stored and marked, and their readings are not
     used.
     """
-    for event in evidence.lately(EventKind.TIME_DOUBTFUL, LATELY_S):
+    for event in evidence.recent_events(EventKind.TIME_DOUBTFUL, LATELY_S):
         yield event.device, event.text
 
 

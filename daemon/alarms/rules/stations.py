@@ -61,7 +61,7 @@ def instrument_error(evidence: Evidence) -> Iterator[Finding]:
     """
     good_s = {station.name: station.good_age_s for station in evidence.acquisition.stations}
     silent = {station.name for station in evidence.acquisition.stations if station.status == SILENT}
-    for event in evidence.standing(EventKind.INSTRUMENT_ERROR):
+    for event in evidence.active_events(EventKind.INSTRUMENT_ERROR):
         since = good_s.get(event.device)
         is_over = since is not None and since < event.age_s and event.age_s > 30.0
         if not is_over and event.device not in silent and not evidence.is_cut_off(event.device):

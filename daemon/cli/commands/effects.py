@@ -45,8 +45,8 @@ def effects(name: str | None, rig: str, *, as_json: bool) -> dict[str, object]:
     found = load_rig(rig).rig
     if name is not None and name not in library():
         raise click.BadParameter(f"{name!r} is unknown; there are {', '.join(library())}", param_hint="NAME")
-    situation = measured_everything(found)
-    families = [described(library()[one], situation) for one in ([name] if name else library())]
+    context = measured_everything(found)
+    families = [described(library()[one], context) for one in ([name] if name else library())]
     result: dict[str, object] = {"rig": found.name, "effects": families}
     if not as_json:
         if name is None:
@@ -83,12 +83,12 @@ def measured_everything(rig: Rig) -> EffectContext:
     return replace(volume, observations=replace(observations, extra=extra))
 
 
-def described(family: Family, situation: EffectContext) -> dict[str, Any]:
+def described(family: Family, context: EffectContext) -> dict[str, Any]:
     """Describe a family of effects, with the coefficients of its simplest form at each place of a rig."""
     places = []
-    for where in family.places(situation.rig):
-        variants = family.variants(situation, where)
-        coefficients = _coefficients(family, situation, where, variants[0]) if variants else []
+    for where in family.places(context.rig):
+        variants = family.variants(context, where)
+        coefficients = _coefficients(family, context, where, variants[0]) if variants else []
         places.append({"where": where, "needs": family.needs(where), "coefficients": coefficients})
     return {
         "family": family.name,
@@ -101,12 +101,12 @@ def described(family: Family, situation: EffectContext) -> dict[str, Any]:
 
 
 def _coefficients(
-    family: Family, situation: EffectContext, where: str, settings: Mapping[str, float]
+    family: Family, context: EffectContext, where: str, settings: Mapping[str, float]
 ) -> list[dict[str, Any]]:
     """Return the coefficients as outputs list them; without bounds where these follow from others."""
     from calibration.effects.base import FittedCoefficient
 
-    fitted = family.coefficients(situation, where, settings)
+    fitted = family.coefficients(context, where, settings)
     bounds = {c.name: (c.lower, c.upper) for c in fitted} | dict(family.reported_limits())
     listed = family.reported(settings, tuple(FittedCoefficient(c.name, c.unit, 0.0, 0.0, c.sigma) for c in fitted))
     return [

@@ -157,10 +157,10 @@ def _parameters(model: CalibratedModel) -> Iterator[ParameterLine]:
 
 def _effects(training: Evaluation) -> Iterator[EffectLine]:
     model, observations = training.model, training.observations
-    situation = Predictor.of(model).context(observations)
+    context = Predictor.of(model).context(observations)
     for effect in model.effects:
         alone = AppliedEffects((effect,), model.chain)
-        columns = alone.columns(situation)
+        columns = alone.columns(context)
         if columns.shift_mm is None:
             change, unit = np.abs(columns.column @ alone.values).max(), model.rig.joint(effect.where).unit
         else:

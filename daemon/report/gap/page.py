@@ -105,9 +105,9 @@ def _size(coefficient: FittedCoefficient) -> float:
 
 def coefficient_bounds(gap: GapResult, effect: FittedEffect) -> dict[str, tuple[float, float]]:
     """Return coefficient -> its finite hard limits: those of the comparison, else those of the library."""
-    situation = EffectContext(gap.model.chain, gap.model.values, gap.observations)
+    context = EffectContext(gap.model.chain, gap.model.values, gap.observations)
     family = library()[effect.family]
-    limits = {c.name: (c.lower, c.upper) for c in family.coefficients(situation, effect.where, effect.settings)}
+    limits = {c.name: (c.lower, c.upper) for c in family.coefficients(context, effect.where, effect.settings)}
     limits |= family.reported_limits()
     for candidate in (c for round_ in gap.rounds for c in round_.candidates):
         if (candidate.family, candidate.where) == (effect.family, effect.where):

@@ -15,7 +15,7 @@ _COLUMNS = """id, event, kind, subject, severity, text, remedy, utc_ns, monotoni
     raised_utc_ns, raised_monotonic_ns, raised_boot_id"""
 _WAITING = f"""SELECT {_COLUMNS} FROM notices WHERE target = ? AND sent_utc_ns IS NULL AND utc_ns >= ?
     ORDER BY id DESC LIMIT ?"""
-_STANDING = f"""SELECT {_COLUMNS} FROM notices WHERE event = 'raised' AND id IN
+_UNCLEARED = f"""SELECT {_COLUMNS} FROM notices WHERE event = 'raised' AND id IN
     (SELECT max(id) FROM notices WHERE target = ? AND event != 'test' GROUP BY kind, subject)"""
 _MARK = """UPDATE notices SET sent_utc_ns = ?, sent_monotonic_ns = ?, sent_boot_id = ?
     WHERE target = ? AND sent_utc_ns IS NULL AND id <= ?"""
@@ -52,9 +52,9 @@ class NoticeTable:
         found = self._rows(_WAITING, target, since_utc_ns, most)
         return [*reversed(found)]
 
-    def standing(self, target: str) -> list[dict[str, Any]]:
-        """The newest notice of each alarm of which a target was not told that it is over."""
-        return self._rows(_STANDING, target)
+    def uncleared(self, target: str) -> list[dict[str, Any]]:
+        """Return the newest notice of each alarm for which a target has received no clearing notice."""
+        return self._rows(_UNCLEARED, target)
 
     def sent_since(self, target: str, since_utc_ns: int) -> list[int]:
         """When a target was told something, UTC ns, oldest first."""

@@ -97,7 +97,7 @@ _BETWEEN = """SELECT 1 FROM observations AS o JOIN control_shots AS c ON c.sessi
     WHERE o.session_id = ? AND o.excluded IS NULL
         AND (o.boot_id, o.monotonic_ns) > (c.boot_id, c.monotonic_ns) LIMIT 1"""
 # The newest fix of each standstill, by session, from an instant on.
-_STANDING = """SELECT max(o.id) AS id, o.session_id, o.prism, o.x_mm, o.y_mm, o.z_mm, o.values_json
+_STANDSTILLS = """SELECT max(o.id) AS id, o.session_id, o.prism, o.x_mm, o.y_mm, o.z_mm, o.values_json
     FROM calibration_sessions AS s JOIN observations AS o ON o.session_id = s.id
     WHERE s.setup_id = ? AND s.rig = ? AND s.state != 'aborted' AND o.excluded IS NULL AND o.pose IS NOT NULL
         AND coalesce(s.excluded, '') NOT LIKE ?
@@ -310,7 +310,7 @@ class SessionTable:
 
     # ---- their prism ------------------------------------------------------------------------------------------------
 
-    def standing(self, setup_id: str, since: Stamp | None) -> list[dict[str, Any]]:
+    def standstill_observations(self, setup_id: str, since: Stamp | None) -> list[dict[str, Any]]:
         """The newest observation of each standstill at a set-up that calibration may use, oldest first.
 
         Those of sessions that were recorded with another rig file are left out.
@@ -323,7 +323,7 @@ class SessionTable:
             session_id, prism, x_mm, y_mm, z_mm and values_json, at most 500 of them.
         """
         first = (0, 0) if since is None else self._store.order(since)
-        return self._store.rows(_STANDING, (setup_id, self._rig, f"{OTHER_RIG_FILE}%", *first))[::-1]
+        return self._store.rows(_STANDSTILLS, (setup_id, self._rig, f"{OTHER_RIG_FILE}%", *first))[::-1]
 
     def add_confirmation(self, session_id: str, at: Stamp, **columns: object) -> None:
         """Add a word that the session's stations are on its prism: `operator` and caller, or `turning`."""

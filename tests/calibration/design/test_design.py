@@ -316,7 +316,7 @@ def test_what_no_pose_can_show_is_refused_by_name() -> None:
     knowledge, _, candidates = situation(shipped_rig("ur10"), 50)
     with pytest.raises(DataError, match="joint_compliance@q1: does nothing at q1"):
         plan(knowledge, candidates, 5, separate=("joint_compliance@q1", "joint_compliance@q2"))
-    with pytest.raises(DataError, match="only 50 reachable poses in view were found, 51 are asked for"):
+    with pytest.raises(DataError, match="only 50 reachable poses in view were found, 51 are requested"):
         plan(knowledge, candidates, 51)
     with pytest.raises(UnsafeError, match="none is reachable with a prism in view of the station at 1000000000, 0, 0"):
         plan_poses(shipped_rig("ur10"), 5, station_mm=np.array([1e9, 0.0, 0.0]))

@@ -72,10 +72,10 @@ def test_accuracy_and_plan_are_of_the_same_setup(model: CalibratedModel) -> None
     planned = plan_poses(RIG, 8, model=model)
     assert planned.before is not None
     assert (planned.before.setup, planned.after.setup) == ("B", "B")
-    assert "where set-up 'B' of the model has it" in planned.station
+    assert "as in set-up 'B' of the model" in planned.station
     other = plan_poses(RIG, 8, model=model, setup="A")
     assert other.after.setup == "A"
-    assert "where set-up 'A' of the model has it" in other.station
+    assert "as in set-up 'A' of the model" in other.station
     with pytest.raises(UnsafeError, match=r"set-up 'C' is unknown to the model \(known: 'A', 'B'\)"):
         setup_of(model, "C")
 
@@ -99,5 +99,5 @@ def test_an_effect_that_the_model_has_is_told_apart_as_if_it_were_new(model: Cal
 
 def test_a_rig_file_that_was_edited_since_is_refused(model: CalibratedModel) -> None:
     joints = (RIG.joints[0].model_copy(update={"limits": (-10.0, 10.0)}), *RIG.joints[1:])
-    with pytest.raises(UnsafeError, match="differs from the one that the model was calibrated with, in its joints"):
+    with pytest.raises(UnsafeError, match="differs from the rig that the model was calibrated with, in joints"):
         plan_poses(RIG.model_copy(update={"joints": joints}), 5, model=model)

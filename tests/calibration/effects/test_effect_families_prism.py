@@ -116,21 +116,21 @@ def test_fixes_are_moved_as_the_simulator_does(simulated: str, machine: RigTruth
     name, where, values = ALIKE[simulated]
     hidden = measured(replace_effects(machine, parse_effects(simulated)), 120, 2)
     true_shift = hidden.position_mm - still.position_mm
-    situation = placed(machine, hidden)
-    settings = library()[name].variants(situation, where)[0]
-    additions = Choice(name, where, settings).columns(situation)
+    context = placed(machine, hidden)
+    settings = library()[name].variants(context, where)[0]
+    additions = Choice(name, where, settings).columns(context)
     assert rms(true_shift) > 0.2
     # What is left: the carrier's tilt, which turns the loads a little, and terms of second order.
     assert rms(additions.shifted_mm(np.array(values)) - true_shift) < 0.005 * rms(true_shift)
 
 
 def test_a_mounting_that_does_not_grow_is_one_of_no_length(machine: RigTruth, still: Observations) -> None:
-    family, situation = moving_prisms("thermal_expansion"), placed(machine, still)
-    _, links = family.variants(situation, "boom")
+    family, context = moving_prisms("thermal_expansion"), placed(machine, still)
+    _, links = family.variants(context, "boom")
     bare = BOOM.model_copy(update={"prisms": tuple(p.model_copy(update={"offset_mm": (0, 0, 0)}) for p in BOOM.prisms)})
-    at_frames = EffectContext(Chain(bare, situation.chain.placements), situation.x, still)
+    at_frames = EffectContext(Chain(bare, context.chain.placements), context.x, still)
     (all_of_it,) = family.variants(at_frames, "boom")
-    grown = family.shift_mm(situation, "boom", links)
+    grown = family.shift_mm(context, "boom", links)
     np.testing.assert_allclose(grown, family.shift_mm(at_frames, "boom", all_of_it), atol=1e-9)
     assert family.names(links) == ("per_K",)
 
@@ -162,14 +162,14 @@ def test_a_step_acts_after_its_instant(
     after = float(np.sort(still.extra["time_s"])[70]) - 1.0
     (simulated,) = parse_effects(f"{text}:time_s={after}")
     hidden = measured(replace_effects(machine, [simulated]), 120, 2)
-    situation = placed(machine, hidden)
+    context = placed(machine, hidden)
     family, where = moving_prisms(simulated.family), simulated.where
-    grid = family.variants(situation, where)
+    grid = family.variants(context, where)
     near = min(grid, key=lambda settings: abs(settings["time_s"] - after))
-    finer = family.refined(situation, where, near)  # none where the grid has every instant
+    finer = family.refined(context, where, near)  # none where the grid has every instant
     exact = min(finer or grid, key=lambda settings: abs(settings["time_s"] - after))
     assert abs(exact["time_s"] - after) < 2.0 * np.sqrt(3.0) * exact["time_error_s"]
-    additions = Choice(simulated.family, where, exact).columns(situation)
+    additions = Choice(simulated.family, where, exact).columns(context)
     shift = hidden.position_mm - still.position_mm
     assert rms(shift) > 5.0
     assert rms(additions.shifted_mm(np.array(values)) - shift) < 0.01 * rms(shift)
@@ -178,17 +178,17 @@ def test_a_step_acts_after_its_instant(
 def test_a_carrier_that_turns_on_the_spot_has_a_form_with_its_heading_alone(
     machine: RigTruth, still: Observations
 ) -> None:
-    family, situation = moving_prisms("base_shift"), placed(machine, still)
+    family, context = moving_prisms("base_shift"), placed(machine, still)
     moved, turned = (
-        next(s for s in family.variants(situation, "base") if bool(family.form(s)) is on_the_spot)
+        next(s for s in family.variants(context, "base") if bool(family.form(s)) is on_the_spot)
         for on_the_spot in (False, True)
     )
     assert (family.form(turned), family.names(turned)) == ("turned on the spot", ("heading_rad",))
     np.testing.assert_array_equal(
-        family.shift_mm(situation, "base", turned), family.shift_mm(situation, "base", moved)[:, :, 2:]
+        family.shift_mm(context, "base", turned), family.shift_mm(context, "base", moved)[:, :, 2:]
     )
-    assert all(family.form(form) for form in family.refined(situation, "base", turned))
-    (effect,) = (Choice("base_shift", "base", turned).fitted(situation, np.array([1e-3]), np.array([1e-4])),)
+    assert all(family.form(form) for form in family.refined(context, "base", turned))
+    (effect,) = (Choice("base_shift", "base", turned).fitted(context, np.array([1e-3]), np.array([1e-4])),)
     assert [c.name for c in effect.reported] == ["x_mm", "y_mm", "heading_rad", "time_s"]
     assert [c.value for c in effect.reported[:3]] == [0.0, 0.0, 1e-3]
 
@@ -199,29 +199,29 @@ def test_a_link_of_any_convention_gives_way_where_its_joint_is(name: str, where:
     known = tuple(prism.model_copy(update={"offset_known": True}) for prism in rig.prisms)
     truth = RigTruth(rig.model_copy(update={"prisms": known}), 4, perturbation=0.0)
     still = measured(truth, 40, 2)
-    situation = placed(truth, still)
-    settings = library()["lateral_compliance"].variants(situation, where)[0]
-    (own,) = library()["lateral_compliance"].coefficients(situation, where, settings)
+    context = placed(truth, still)
+    settings = library()["lateral_compliance"].variants(context, where)[0]
+    (own,) = library()["lateral_compliance"].coefficients(context, where, settings)
     value = 5.0 * own.sigma
     soft = replace_effects(truth, parse_effects(f"lateral_compliance@{where}:compliance_rad_per_Nm={value}"))
     prism = rig.prism_names[0]
     shift = soft.prism_mm(prism, still.joints) - truth.prism_mm(prism, still.joints)
-    found = Choice("lateral_compliance", where, settings).columns(situation).shifted_mm(np.array([value]))
+    found = Choice("lateral_compliance", where, settings).columns(context).shifted_mm(np.array([value]))
     assert rms(shift) > 0.2
     assert rms(found - shift) < 0.01 * rms(shift)
 
 
 def test_whatever_the_weights_are_a_links_turn_has_few_shapes(machine: RigTruth, still: Observations) -> None:
-    situation, rng = placed(machine, still), np.random.default_rng(1)
+    context, rng = placed(machine, still), np.random.default_rng(1)
     for name, where in (("lateral_compliance", "theta3"), ("passive_compliance", "row2")):
         family = moving_prisms(name)
-        plain, shaped = family.variants(situation, where)
-        columns = family.shift_mm(situation, where, shaped).reshape(-1, len(family.names(shaped)))
-        np.testing.assert_allclose(family.shift_mm(situation, where, plain).ravel(), columns[:, 0], rtol=1e-12)
+        plain, shaped = family.variants(context, where)
+        columns = family.shift_mm(context, where, shaped).reshape(-1, len(family.names(shaped)))
+        np.testing.assert_allclose(family.shift_mm(context, where, plain).ravel(), columns[:, 0], rtol=1e-12)
         for _ in range(5):
             masses = tuple(m.model_copy(update={"kg": m.kg * (1.0 + rng.uniform(-0.15, 0.15))}) for m in BOOM.masses)
-            other = Chain(BOOM.model_copy(update={"masses": masses}), situation.chain.placements)
-            turned = family.shift_mm(EffectContext(other, situation.x, still), where, plain).ravel()
+            other = Chain(BOOM.model_copy(update={"masses": masses}), context.chain.placements)
+            turned = family.shift_mm(EffectContext(other, context.x, still), where, plain).ravel()
             found, *_ = np.linalg.lstsq(columns, turned)
             assert rms((turned - columns @ found).reshape(-1, 3)) < 3e-3 * rms(turned.reshape(-1, 3))
 
@@ -245,9 +245,9 @@ mass = [{ name = "load", frame = 2, kg = 100, centre_mm = [0, 0, 0] }]
     table = simulate_observations(truth, 20, 1, noise_mm=0.0)
     observations = parse_observations(table.csv_text().encode(), rig, "pole.csv")
     chain = Chain(rig, {"": Placement.identity()})
-    situation = EffectContext(chain, np.zeros(len(chain)), observations)
+    context = EffectContext(chain, np.zeros(len(chain)), observations)
     family = moving_prisms("boom_droop")
-    shift = family.shift_mm(situation, "boom", family.variants(situation, "boom")[0])[:, :, 0]
+    shift = family.shift_mm(context, "boom", family.variants(context, "boom")[0])[:, :, 0]
     length_m = 2.0 + observations.joints["out"] / 1e3
     newton = 100.0 * 9.80665
     tip = observations.prism == "tip"
@@ -258,11 +258,11 @@ mass = [{ name = "load", frame = 2, kg = 100, centre_mm = [0, 0, 0] }]
 
 
 def test_whatever_the_weights_are_the_droop_has_a_size_and_few_shapes(machine: RigTruth, still: Observations) -> None:
-    situation = placed(machine, still)
+    context = placed(machine, still)
     family = moving_prisms("boom_droop")
-    plain, *shaped = family.variants(situation, "boom")
-    columns = family.shift_mm(situation, "boom", shaped[0]).reshape(-1, len(family.names(shaped[0])))
-    np.testing.assert_allclose(family.shift_mm(situation, "boom", plain).ravel(), columns[:, 0], rtol=1e-12)
+    plain, *shaped = family.variants(context, "boom")
+    columns = family.shift_mm(context, "boom", shaped[0]).reshape(-1, len(family.names(shaped[0])))
+    np.testing.assert_allclose(family.shift_mm(context, "boom", plain).ravel(), columns[:, 0], rtol=1e-12)
     size = np.sqrt((columns[:, 0] ** 2).mean())
     rng = np.random.default_rng(1)
     scales = []
@@ -276,33 +276,33 @@ def test_whatever_the_weights_are_the_droop_has_a_size_and_few_shapes(machine: R
             )
             for m in BOOM.masses
         )
-        other = Chain(BOOM.model_copy(update={"masses": masses}), situation.chain.placements)
-        droop = family.shift_mm(EffectContext(other, situation.x, still), "boom", plain).ravel()
+        other = Chain(BOOM.model_copy(update={"masses": masses}), context.chain.placements)
+        droop = family.shift_mm(EffectContext(other, context.x, still), "boom", plain).ravel()
         found, *_ = np.linalg.lstsq(columns, droop)
         assert np.sqrt(((droop - columns @ found) ** 2).mean()) < 3e-3 * size
         scales.append(found[0])
     # How the boom's own weight is spread is uncertain as well: that is not varied here.
     assert np.std(scales) < plain["load_sigma"] < 4.0 * np.std(scales)
     k = columns.shape[1]
-    (reported,) = Choice("boom_droop", "boom", shaped[0]).fitted(situation, np.ones(k), np.full(k, 1e-3)).reported
+    (reported,) = Choice("boom_droop", "boom", shaped[0]).fitted(context, np.ones(k), np.full(k, 1e-3)).reported
     assert reported.name == "flexibility_per_Nm2"
     assert reported.standard_error == pytest.approx(plain["load_sigma"], rel=1e-3)
 
 
 @pytest.mark.parametrize("name", MINE)
 def test_a_family_that_moves_prisms_has_sane_numbers_wherever_it_may_be(name: str, machine: RigTruth) -> None:
-    situation = placed(machine, measured(machine, 60, 3, span_h=2.0))
+    context = placed(machine, measured(machine, 60, 3, span_h=2.0))
     family = moving_prisms(name)
     assert set(family.confused_with) <= library().keys() - {name}
     assert family.places(BOOM)
     for where in family.places(BOOM):
-        variants = family.variants(situation, where)
+        variants = family.variants(context, where)
         assert variants
         for settings in (variants[0], variants[-1]):
-            coefficients = family.coefficients(situation, where, settings)
+            coefficients = family.coefficients(context, where, settings)
             assert tuple(c.name for c in coefficients) == family.names(settings)
             assert all(0.0 < c.sigma < c.upper and c.lower in (0.0, -c.upper) for c in coefficients)
-            shift = family.shift_mm(situation, where, settings)
+            shift = family.shift_mm(context, where, settings)
             assert shift.shape == (60, 3, len(coefficients))
             assert 0.01 < np.abs(shift[:, :, 0]).max() * coefficients[0].sigma < 100.0
         with pytest.raises(ValueError, match="setting"):
@@ -310,11 +310,11 @@ def test_a_family_that_moves_prisms_has_sane_numbers_wherever_it_may_be(name: st
 
 
 def test_the_boom_and_what_is_fixed_before_it_stay_where_they_are(machine: RigTruth, still: Observations) -> None:
-    situation = placed(machine, still)
+    context = placed(machine, still)
     before = still.prism == "w"
     for name in ("boom_droop", "pad_play"):
-        settings = library()[name].variants(situation, "boom")[0]
-        shift = moving_prisms(name).shift_mm(situation, "boom", settings)
+        settings = library()[name].variants(context, "boom")[0]
+        shift = moving_prisms(name).shift_mm(context, "boom", settings)
         np.testing.assert_array_equal(shift[before], 0.0)
         assert (np.abs(shift[~before]).max(axis=(1, 2)) > 0.0).all()
 
@@ -351,8 +351,8 @@ def test_a_step_is_as_likely_at_an_instant_of_the_grid_as_the_time_about_it_is_l
     times = np.array([settings["time_s"] for settings in fine])
     among_the_rows = (np.abs(times - 1800.0) > 1000.0).astype(float)
     in_between = 0.2 * (1.0 - among_the_rows)
-    settled = STEP.settled(fine, (among_the_rows + in_between) / (among_the_rows + in_between).sum())
-    assert 60.0 < settled["time_s"] < 3600.0
+    step = STEP.posterior_settings(fine, (among_the_rows + in_between) / (among_the_rows + in_between).sum())
+    assert 60.0 < step["time_s"] < 3600.0
 
 
 def test_a_step_is_refined_to_every_instant_up_to_its_neighbours_on_the_grid() -> None:
@@ -367,10 +367,10 @@ def test_a_step_is_refined_to_every_instant_up_to_its_neighbours_on_the_grid() -
     (gap,) = np.diff(np.sort(time_s))[between][[0]]
     assert fine[0]["time_error_s"] == pytest.approx(gap / np.sqrt(12.0))
     assert refined_steps(time_s[:30], step_grid(time_s[:30])[2]) == ()  # the grid has them all
-    settled = STEP.settled(fine, np.eye(len(fine))[3])
-    assert settled["time_s"] == times[3]
-    assert settled["time_error_s"] == pytest.approx(fine[3]["time_error_s"])
-    either = STEP.settled(fine, 0.5 * (np.eye(len(fine))[3] + np.eye(len(fine))[5]))
+    step = STEP.posterior_settings(fine, np.eye(len(fine))[3])
+    assert step["time_s"] == times[3]
+    assert step["time_error_s"] == pytest.approx(fine[3]["time_error_s"])
+    either = STEP.posterior_settings(fine, 0.5 * (np.eye(len(fine))[3] + np.eye(len(fine))[5]))
     shares = np.array([fine[3]["time_error_s"], fine[5]["time_error_s"]])
     assert either["time_error_s"] > np.sqrt(shares.min() / shares.sum()) * (times[5] - times[3])
     many = np.random.default_rng(2).uniform(0.0, 7200.0, 20_000)
@@ -384,14 +384,14 @@ def test_prisms_face_and_move_as_the_reference_kinematics_have_it() -> None:
     rigs = [parse_rig((RIGS / f"{name}.toml").read_text(encoding="utf-8"), name) for name in ("torso", "arm7")]
     for rig in (BOOM, shipped_rig("ys100"), *rigs):
         truth = RigTruth(rig, 3)
-        situation = placed(truth, measured(truth, 24, 4))
-        chain, data, facing = situation.chain, situation.data, situation.facing
-        reference = chain.linearise(situation.x, data)
+        context = placed(truth, measured(truth, 24, 4))
+        chain, data, facing = context.chain, context.data, context.facing
+        reference = chain.linearise(context.x, data)
         for joint in range(len(rig.joints)):
-            own = [number for number, (_, driving) in enumerate(situation.machine.drives) if driving == joint]
-            moved = situation.to_station(facing.by_drive[:, :, own])
+            own = [number for number, (_, driving) in enumerate(context.machine.drives) if driving == joint]
+            moved = context.to_station(facing.by_drive[:, :, own])
             np.testing.assert_allclose(moved.sum(axis=2), reference.joint_jacobian[:, :, joint], atol=1e-9)
-        axes = situation.to_station(facing.axes.transpose(0, 2, 1))
+        axes = context.to_station(facing.axes.transpose(0, 2, 1))
         for row, prism in enumerate(data.prism):
             offsets = [op.parameter for op in chain.prism_ops[prism]]
             np.testing.assert_allclose(axes[row], reference.jacobian[row][:, offsets], atol=1e-12)
@@ -456,11 +456,11 @@ def test_rows_that_lack_a_column_are_left_alone_and_made_as_uncertain_as_the_eff
 ) -> None:
     family = moving_prisms(name)
     (where,) = family.places(BOOM)
-    situation = placed(machine, still)
-    settings = family.variants(situation, where)[0]
-    shift = family.shift_mm(situation, where, settings)
+    context = placed(machine, still)
+    settings = family.variants(context, where)[0]
+    shift = family.shift_mm(context, where, settings)
     np.testing.assert_array_equal(family.shift_mm(placed(machine, replace(still, extra={})), where, settings), 0.0)
-    values = np.array([c.sigma for c in family.coefficients(situation, where, settings)])
+    values = np.array([c.sigma for c in family.coefficients(context, where, settings)])
     was = float(np.mean((shift @ values) ** 2))
     assert 0.3 * was < family.unknown_variance(values, values, settings) < 3.0 * was
 
@@ -468,8 +468,8 @@ def test_rows_that_lack_a_column_are_left_alone_and_made_as_uncertain_as_the_eff
 def test_ground_that_comes_to_rest_has_sunk_as_much_by_then_as_its_mean_rate_says(
     machine: RigTruth, still: Observations
 ) -> None:
-    family, situation = moving_prisms("base_settlement"), placed(machine, still)
-    steady, *slowing = (family.shift_mm(situation, "base", form) for form in family.variants(situation, "base"))
+    family, context = moving_prisms("base_settlement"), placed(machine, still)
+    steady, *slowing = (family.shift_mm(context, "base", form) for form in family.variants(context, "base"))
     for number, shift in enumerate(slowing):
         np.testing.assert_array_equal(shift[0], 0.0)
         np.testing.assert_allclose(shift[-1], steady[-1])

@@ -43,7 +43,7 @@ def measured(rig: Rig, effects: str, n: int, seed: int, *, noise_mm: float, pert
     return parse_observations(table.csv_text().encode(), rig, "simulated.csv")
 
 
-def nominal_situation(rig: Rig, observations: Observations) -> EffectContext:
+def nominal_context(rig: Rig, observations: Observations) -> EffectContext:
     chain = Chain(rig, {"": Placement.identity()})
     return EffectContext(chain, np.zeros(len(chain)), observations)
 
@@ -61,12 +61,12 @@ def test_a_curve_of_stiffness_is_symmetric_or_not_and_straight_beyond_its_data()
     rig = shipped_rig("swdt82").model_copy(update={"masses": ()})
     torque = np.linspace(-2000.0, 2000.0, 81)
     blank = measured(shipped_rig("swdt82"), "", 81, 3, noise_mm=3.0)
-    situation = nominal_situation(rig, replace(blank, extra={"theta4_Nm": torque}))
+    context = nominal_context(rig, replace(blank, extra={"theta4_Nm": torque}))
     symmetric = {"torque_Nm": 1000.0, "knot_power": 2.0, "bend_rad": 1e-3}
-    columns = family.columns(situation, "theta4", symmetric)
+    columns = family.columns(context, "theta4", symmetric)
     np.testing.assert_allclose(columns, -columns[::-1], atol=1e-9 * np.abs(columns).max())
     for settings in (symmetric, {"low_Nm": -500.0, "high_Nm": 1000.0, "bend_rad": 1e-3}):
-        second = np.diff(family.columns(situation, "theta4", settings), 2, axis=0)
+        second = np.diff(family.columns(context, "theta4", settings), 2, axis=0)
         outside = (torque[1:-1] < -1050.0) | (torque[1:-1] > 1050.0)
         assert np.abs(second[outside]).max() < 1e-9 * np.abs(second).max()
         assert (np.abs(second[:, 1:]).max(axis=0) > 0.0).all()
@@ -76,8 +76,8 @@ def test_loads_that_are_not_measured_everywhere_act_where_they_are() -> None:
     rig = shipped_rig("swdt82").model_copy(update={"masses": ()})
     torque = np.where(np.arange(30) < 20, 1000.0, np.nan)
     blank = measured(shipped_rig("swdt82"), "", 30, 3, noise_mm=3.0)
-    situation = nominal_situation(rig, replace(blank, extra={"theta4_Nm": torque}))
-    column = library()["joint_compliance"].columns(situation, "theta4", {})
+    context = nominal_context(rig, replace(blank, extra={"theta4_Nm": torque}))
+    column = library()["joint_compliance"].columns(context, "theta4", {})
     np.testing.assert_allclose(column[:20, 0], np.degrees(1000.0))
     np.testing.assert_array_equal(column[20:], 0.0)
 
@@ -193,7 +193,7 @@ def test_effects_can_be_switched_off_or_asked_for_by_name(session: Session) -> N
 
 
 def test_a_vertical_axis_carries_nothing(stiff: Fitted) -> None:
-    with pytest.raises(DataError, match="joint_compliance@theta1 cannot do anything in any pose"):
+    with pytest.raises(DataError, match="joint_compliance@theta1 has no effect in any pose"):
         adopt(stiff.adopted.solution, stiff.training, "joint_compliance@theta1")
 
 
@@ -279,8 +279,8 @@ def test_a_refitted_base_keeps_the_effects(stiff: Fitted) -> None:
 
 
 def test_coefficients_and_columns_have_one_order(stiff: Fitted) -> None:
-    situation = EffectContext(stiff.model.chain, stiff.model.values, stiff.training)
-    additions = fitted_columns(stiff.model.effects, situation)
+    context = EffectContext(stiff.model.chain, stiff.model.values, stiff.training)
+    additions = fitted_columns(stiff.model.effects, context)
     assert (
         len(additions)
         == len(coefficient_values(stiff.model.effects))

@@ -90,7 +90,7 @@ def everything(rig: Rig, session: Observations) -> Observations:
 
 
 @pytest.fixture(scope="module")
-def situation(session: Session) -> EffectContext:
+def context(session: Session) -> EffectContext:
     return EffectContext(
         Chain(session.rig.with_signals(*TILTS), session.model.placements),
         session.model.values,
@@ -98,15 +98,15 @@ def situation(session: Session) -> EffectContext:
     )
 
 
-def forms(family: Family, situation: EffectContext) -> Iterator[tuple[str, Settings]]:
-    for where in family.places(situation.rig):
-        for settings in family.variants(situation, where):
+def forms(family: Family, context: EffectContext) -> Iterator[tuple[str, Settings]]:
+    for where in family.places(context.rig):
+        for settings in family.variants(context, where):
             yield where, settings
 
 
-def moved_mm(situation: EffectContext, choice: Choice) -> Floats:
+def moved_mm(context: EffectContext, choice: Choice) -> Floats:
     """(n, 3, k) by unit coefficients, in the station's frame."""
-    return choice.columns(situation).moved_mm(situation.to_station(situation.located.joint_jacobian))
+    return choice.columns(context).moved_mm(context.to_station(context.located.joint_jacobian))
 
 
 def test_the_library_has_the_families_of_the_contract_and_every_file_is_one() -> None:
@@ -127,12 +127,12 @@ def test_a_family_says_what_it_is_what_looks_like_it_and_what_shows_it(name: str
 @pytest.mark.parametrize(("name", "family"), FAMILIES)
 @pytest.mark.slow
 def test_a_family_has_sane_numbers_wherever_it_may_be_on_the_boom(
-    name: str, family: Family, situation: EffectContext
+    name: str, family: Family, context: EffectContext
 ) -> None:
-    found = list(forms(family, situation))
+    found = list(forms(family, context))
     assert found
     for where, settings in found:
-        coefficients = family.coefficients(situation, where, settings)
+        coefficients = family.coefficients(context, where, settings)
         assert tuple(c.name for c in coefficients) == family.names(settings)
         for c in coefficients:
             assert 0.0 < c.sigma < c.upper
@@ -147,46 +147,46 @@ def test_a_family_has_sane_numbers_wherever_it_may_be_on_the_boom(
         sigma = np.array([c.sigma for c in coefficients])
         variance = family.unknown_variance(sigma, sigma, settings)
         assert 0.0 <= variance < np.inf
-        assert Choice(name, where, settings).columns(situation).column.dtype == np.float64
+        assert Choice(name, where, settings).columns(context).column.dtype == np.float64
         # Plausible sizes are seen by an instrument of 0.01 mm, and no accident.
-        moved = moved_mm(situation, Choice(name, where, settings)) * sigma
+        moved = moved_mm(context, Choice(name, where, settings)) * sigma
         assert moved.shape == (ROWS, 3, len(coefficients))
         assert np.isfinite(moved).all()
         assert 1e-2 < np.abs(moved).max() < 300.0, (where, settings)
 
 
 @pytest.mark.parametrize("family", library().values(), ids=list(library()))
-def test_a_family_has_forms_where_a_spindle_turns_no_row(family: Family, situation: EffectContext) -> None:
-    rig = situation.rig
+def test_a_family_has_forms_where_a_spindle_turns_no_row(family: Family, context: EffectContext) -> None:
+    rig = context.rig
     spindle = rig.joint("L3").model_copy(update={"kind": "revolute"})
     joints = tuple(spindle if joint.name == "L3" else joint for joint in rig.joints)
-    chain = Chain(rig.model_copy(update={"joints": joints}), situation.chain.placements)
-    there = EffectContext(chain, situation.x, situation.observations)
+    chain = Chain(rig.model_copy(update={"joints": joints}), context.chain.placements)
+    there = EffectContext(chain, context.x, context.observations)
     for where, settings in forms(family, there):
         assert np.isfinite(moved_mm(there, Choice(family.name, where, settings))).all()
 
 
 @pytest.mark.parametrize("family", library().values(), ids=list(library()))
 def test_columns_are_the_derivative_of_what_a_model_predicts(
-    family: Family, situation: EffectContext, session: Session
+    family: Family, context: EffectContext, session: Session
 ) -> None:
     """Finite differences through the whole prediction: units, couplings and frames."""
-    observations, model = situation.observations, session.model
+    observations, model = context.observations, session.model
     parameters = len(model.chain)
-    for where in family.places(situation.rig):
-        for settings in family.variants(situation, where)[:1]:
+    for where in family.places(context.rig):
+        for settings in family.variants(context, where)[:1]:
             choice = Choice(family.name, where, settings)
-            coefficients = family.coefficients(situation, where, settings)
+            coefficients = family.coefficients(context, where, settings)
             covariance = np.zeros((parameters + len(coefficients),) * 2)
             covariance[:parameters, :parameters] = model.covariance
-            by_column = moved_mm(situation, choice)
+            by_column = moved_mm(context, choice)
             for i, c in enumerate(coefficients):
                 step = np.zeros(len(coefficients))
                 step[i] = 0.1 * c.sigma
                 ends = [
                     Predictor.of(
                         replace(
-                            model, effects=(choice.fitted(situation, sign * step, 0.0 * step),), covariance=covariance
+                            model, effects=(choice.fitted(context, sign * step, 0.0 * step),), covariance=covariance
                         )
                     ).effects_mm(observations)
                     for sign in (1.0, -1.0)
@@ -198,16 +198,16 @@ def test_columns_are_the_derivative_of_what_a_model_predicts(
 
 @pytest.mark.parametrize(("name", "family"), FAMILIES)
 def test_in_the_base_frame_a_model_has_what_the_machine_does_and_nothing_else(
-    name: str, family: Family, situation: EffectContext, session: Session
+    name: str, family: Family, context: EffectContext, session: Session
 ) -> None:
     """What fixes err by and how the base moves is in the station's frame alone; all other effects are in both."""
-    observations, model = situation.observations, session.model
-    where = family.places(situation.rig)[0]
-    settings = next(settings for at, settings in forms(family, situation) if at == where)
-    sigma = np.array([c.sigma for c in family.coefficients(situation, where, settings)])
+    observations, model = context.observations, session.model
+    where = family.places(context.rig)[0]
+    settings = next(settings for at, settings in forms(family, context) if at == where)
+    sigma = np.array([c.sigma for c in family.coefficients(context, where, settings)])
     covariance = np.zeros((len(model.values) + len(sigma),) * 2)
     erring = replace(
-        model, effects=(Choice(name, where, settings).fitted(situation, sigma, 0.1 * sigma),), covariance=covariance
+        model, effects=(Choice(name, where, settings).fitted(context, sigma, 0.1 * sigma),), covariance=covariance
     )
     base = model.chain.base(model.values, 0)
     of_fixes = (Predictor.of(erring).effects_mm(observations) - base.translation_mm) @ base.rotation
@@ -218,16 +218,16 @@ def test_in_the_base_frame_a_model_has_what_the_machine_does_and_nothing_else(
 
 
 @pytest.mark.parametrize("family", library().values(), ids=list(library()))
-def test_a_family_does_nothing_where_what_it_needs_was_not_measured(family: Family, situation: EffectContext) -> None:
+def test_a_family_does_nothing_where_what_it_needs_was_not_measured(family: Family, context: EffectContext) -> None:
     measured = np.arange(ROWS) >= UNKNOWN
-    extra = {name: np.where(measured, v, np.nan) for name, v in situation.observations.extra.items()}
-    lacking = replace(situation, observations=replace(situation.observations, extra=extra))
-    rig = situation.rig.model_copy(update={"masses": ()})
-    bare = EffectContext(Chain(rig, situation.chain.placements), situation.x, replace(situation.observations, extra={}))
+    extra = {name: np.where(measured, v, np.nan) for name, v in context.observations.extra.items()}
+    lacking = replace(context, observations=replace(context.observations, extra=extra))
+    rig = context.rig.model_copy(update={"masses": ()})
+    bare = EffectContext(Chain(rig, context.chain.placements), context.x, replace(context.observations, extra={}))
     for where in family.places(rig):
         # The path travelled is known from the order of rows none of which has a time.
         assert family.known(bare, where).all() == (not family.needs(where) or family.name == "transducer_cumulative")
-        for settings in family.variants(situation, where)[:1]:
+        for settings in family.variants(context, where)[:1]:
             effect = Choice(family.name, where, settings).columns(lacking)
             of_rows = effect.column if effect.shift_mm is None else effect.shift_mm.reshape(ROWS, -1)
             assert np.isfinite(of_rows).all()
@@ -247,10 +247,10 @@ def test_every_family_copes_with_every_rig_and_with_a_single_row(rig_name: str) 
     full = everything(rig, parse_observations(table.csv_text().encode(), rig, "simulated.csv"))
     chain = Chain(rig, {"": Placement.identity()})
     for rows in (full, full.select(np.arange(1)), replace(full, extra={})):
-        situation = EffectContext(chain, np.zeros(len(chain)), rows)
+        context = EffectContext(chain, np.zeros(len(chain)), rows)
         for name, family in FAMILIES:
-            for where, settings in forms(family, situation):
-                additions = Choice(name, where, settings).columns(situation)
+            for where, settings in forms(family, context):
+                additions = Choice(name, where, settings).columns(context)
                 assert additions.column.dtype == np.float64
                 assert np.isfinite(additions.column).all()
                 assert additions.shift_mm is None or np.isfinite(additions.shift_mm).all()

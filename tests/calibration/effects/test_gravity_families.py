@@ -50,11 +50,11 @@ def perfect(truth: RigTruth, observations: Observations, turn: Floats | None = N
 def test_loads_are_along_the_vertical_of_the_levelled_station() -> None:
     truth = RigTruth(shipped_rig("swdt82"), 5, perturbation=0.0)
     observations = exact(truth, POSES)
-    situation = perfect(truth, observations)
-    upright = replace(situation, levelled=False)
+    context = perfect(truth, observations)
+    upright = replace(context, levelled=False)
     for joint in ("theta1", "theta4", "theta6", "theta8"):
         true = truth.gravity_load(joint, observations.joints)
-        assert np.abs(situation.torque(joint) - true).max() < 1e-6 * np.abs(true).max()
+        assert np.abs(context.torque(joint) - true).max() < 1e-6 * np.abs(true).max()
         assert np.abs(upright.torque(joint) - true).max() > 1e-3 * np.abs(true).max()
 
 
@@ -76,9 +76,9 @@ def unmeasured(rig: Rig, n: int, seed: int) -> Observations:
     return Observations(np.full(n, rig.prism_names[0]), poses, blank, blank, empty, empty, empty)
 
 
-def left_of_a_sign(situation: EffectContext, sign: Floats, settings: Settings) -> float:
+def left_of_a_sign(context: EffectContext, sign: Floats, settings: Settings) -> float:
     """Share of the squares of a sign that the columns of a form leave."""
-    columns = library()["gravity_flip_play"].columns(situation, "theta6", settings)
+    columns = library()["gravity_flip_play"].columns(context, "theta6", settings)
     left = sign - columns @ np.linalg.lstsq(columns, sign)[0]
     return float(left @ left / (sign @ sign))
 
@@ -88,20 +88,20 @@ def test_finer_forms_of_play_find_where_the_load_of_other_masses_changes_its_sig
     found = []
     for seed in range(6):
         truth = RigTruth(rig, seed, perturbation=0.0)
-        situation = perfect(truth, unmeasured(rig, 4000, seed))
-        load = np.abs(situation.torque("theta6"))
-        near = situation.observations.select(np.flatnonzero(load < 0.02 * load.max()))
-        situation = replace(situation, observations=near)
+        context = perfect(truth, unmeasured(rig, 4000, seed))
+        load = np.abs(context.torque("theta6"))
+        near = context.observations.select(np.flatnonzero(load < 0.02 * load.max()))
+        context = replace(context, observations=near)
         factors = 1.0 + np.random.default_rng(seed).uniform(-0.15, 0.15, len(rig.masses))
         masses = tuple(m.model_copy(update={"kg": m.kg * f}) for m, f in zip(rig.masses, factors, strict=True))
         scored = RigTruth(rig.model_copy(update={"masses": masses}), seed, perturbation=0.0)
         sign = np.sign(scored.gravity_load("theta6", near.joints))
-        sharp, *forms = family.variants(situation, "theta6")
-        coarse = min(forms, key=lambda form: left_of_a_sign(situation, sign, form))
-        chosen, *finer = family.refined(situation, "theta6", coarse)
+        sharp, *forms = family.variants(context, "theta6")
+        coarse = min(forms, key=lambda form: left_of_a_sign(context, sign, form))
+        chosen, *finer = family.refined(context, "theta6", coarse)
         assert chosen == coarse
-        finest = min(finer, key=lambda form: left_of_a_sign(situation, sign, form))
-        found.append([left_of_a_sign(situation, sign, form) for form in (sharp, coarse, finest)])
+        finest = min(finer, key=lambda form: left_of_a_sign(context, sign, form))
+        found.append([left_of_a_sign(context, sign, form) for form in (sharp, coarse, finest)])
     as_by_file, coarse_left, finest_left = np.median(found, axis=0)
     assert as_by_file > 0.05
     assert coarse_left < 0.5 * as_by_file
@@ -110,26 +110,26 @@ def test_finer_forms_of_play_find_where_the_load_of_other_masses_changes_its_sig
 
 def test_a_load_that_is_nowhere_near_zero_leaves_nothing_open_about_its_sign() -> None:
     truth = RigTruth(shipped_rig("swdt82"), 5)
-    situation = perfect(truth, exact(truth, POSES))
+    context = perfect(truth, exact(truth, POSES))
     family = library()["gravity_flip_play"]
-    assert family.variants(situation, "theta1") == ({},)
-    assert family.refined(situation, "theta1", {}) == ()
-    assert len(family.variants(situation, "theta6")) > 5
+    assert family.variants(context, "theta1") == ({},)
+    assert family.refined(context, "theta1", {}) == ()
+    assert len(family.variants(context, "theta6")) > 5
 
 
 def test_finer_forms_settle_on_the_mean_of_the_masses_unless_the_first_is_likelier() -> None:
     family = library()["gravity_flip_play"]
     finer = tuple({"spread": 0.15, "other_Nm": 30.0, "shape1": at} for at in (-1.0, 1.0))
-    assert family.settled(({}, *finer), np.array([0.6, 0.4, 0.0])) == {}
-    assert family.settled(({}, *finer), np.array([0.2, 0.2, 0.6]))["shape1"] == pytest.approx(0.5)
+    assert family.posterior_settings(({}, *finer), np.array([0.6, 0.4, 0.0])) == {}
+    assert family.posterior_settings(({}, *finer), np.array([0.2, 0.2, 0.6]))["shape1"] == pytest.approx(0.5)
 
 
 def test_a_model_of_play_with_other_shapes_of_the_load_is_refused() -> None:
     truth = RigTruth(shipped_rig("swdt82"), 5)
-    situation = perfect(truth, exact(truth, POSES))
+    context = perfect(truth, exact(truth, POSES))
     shapes = {f"shape{number}": 0.0 for number in range(1, 10)}
-    with pytest.raises(ModelError, match="9 shapes of a load that has 3; calibrate again"):
-        library()["gravity_flip_play"].columns(situation, "theta6", {"spread": 1.0, "other_Nm": 30.0, **shapes})
+    with pytest.raises(ModelError, match="9 shapes of a load, its rig 3; calibrate again"):
+        library()["gravity_flip_play"].columns(context, "theta6", {"spread": 1.0, "other_Nm": 30.0, **shapes})
 
 
 @pytest.mark.long
@@ -189,8 +189,8 @@ def test_a_run_without_times_in_training_goes_by_time_where_later_rows_have_it()
     change = family.columns(perfect(truth, backwards), "L2", {"mean_m": 0.0})[:, 0]
     assert change[-1] == 0.0
     assert change[0] == pytest.approx(np.abs(np.diff(observations.joints["L2"])).sum() / 1e3)
-    assert family.goes_by_order({"mean_m": 0.0})
-    assert not family.goes_by_order({"mean_m": 0.0, "time_0_s": 0.0, "path_0_m": 1.0})
+    assert family.depends_on_order({"mean_m": 0.0})
+    assert not family.depends_on_order({"mean_m": 0.0, "time_0_s": 0.0, "path_0_m": 1.0})
 
 
 # -- the boom ----------------------------------------------------------------------------------------------------------
@@ -233,9 +233,9 @@ def test_a_telescope_is_a_boom_along_whichever_axis_it_is_written(family: str) -
     observations = exact(RigTruth(x, 1, perturbation=0.0), 40)
     moved = []
     for rig in (x, z):
-        situation = perfect(RigTruth(rig, 1, perturbation=0.0), observations)
-        settings = library()[family].variants(situation, "boom")[0]
-        moved.append(library()[family].shift_mm(situation, "boom", settings))
+        context = perfect(RigTruth(rig, 1, perturbation=0.0), observations)
+        settings = library()[family].variants(context, "boom")[0]
+        moved.append(library()[family].shift_mm(context, "boom", settings))
     assert library()[family].places(x) == library()[family].places(z) == ("boom",)
     assert np.abs(moved[0]).max() > 0.0
     np.testing.assert_allclose(moved[1], moved[0], rtol=1e-9, atol=1e-9 * np.abs(moved[0]).max())

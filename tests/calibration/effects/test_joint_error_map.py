@@ -122,10 +122,10 @@ def test_a_curve_needs_poses_in_each_of_its_waves() -> None:
     assert MAP.variants(at_angles(standstills), "theta4") == ()
     few, many = (MAP.variants(at_angles(rng.uniform(-15.0, 60.0, n)), "theta4") for n in (60, 600))
     assert max(s["pieces"] for s in few) <= 20 < max(s["pieces"] for s in many) <= 60
-    situation = at_angles(rng.uniform(-200.0, 250.0, 600))
-    turn = MAP.variants(situation, "theta4")
+    context = at_angles(rng.uniform(-200.0, 250.0, 600))
+    turn = MAP.variants(context, "theta4")
     assert all("low_deg" not in s for s in turn)
-    assert all(len(MAP.names(s)) == len(MAP.coefficients(situation, "theta4", s)) for s in (*few, *many, *turn))
+    assert all(len(MAP.names(s)) == len(MAP.coefficients(context, "theta4", s)) for s in (*few, *many, *turn))
 
 
 @pytest.mark.parametrize(
@@ -221,16 +221,16 @@ def test_a_curve_does_not_take_the_place_of_a_harmonic_nor_a_harmonic_of_a_curve
 
 def scored(solution: Solution, observations: Observations, where: str) -> dict[str, float]:
     """ln of the Bayes factor of each rival at a joint, at the noise that the best of them leaves."""
-    situation = EffectContext(solution.chain, solution.fit.x, observations)
+    context = EffectContext(solution.chain, solution.fit.x, observations)
     names = ("joint_error_map", "encoder_harmonic", "angle_scale")
-    variants = {n: [Choice(n, where, s) for s in library()[n].variants(situation, where)] for n in names}
+    variants = {n: [Choice(n, where, s) for s in library()[n].variants(context, where)] for n in names}
     fits = [
         joint_fit(solution, observations, [choices[len(choices) // 2]], "recalibration")
         for choices in variants.values()
     ]
     fit = replace(solution.fit, excess_variance=min(f.fit.excess_variance for f in fits))
-    over = Projection(solution, situation, fit)
-    places = [candidate_at(situation, over, name, where, choices) for name, choices in variants.items()]
+    over = Projection(solution, context, fit)
+    places = [candidate_at(context, over, name, where, choices) for name, choices in variants.items()]
     return {w.candidate.family: w.log_bayes_factor for w in Screen(over, places).score()}
 
 

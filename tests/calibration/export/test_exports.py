@@ -66,13 +66,13 @@ def test_the_grid_interpolated_linearly_is_close_to_the_model(session: Session) 
 def model_with(session: Session, effects: str) -> CalibratedModel:
     """The session's model with effects of their plausible sizes."""
     model, rows = session.model, session.held_out
-    situation = EffectContext(model.chain, model.values, replace(rows, extra={"time_s": np.arange(len(rows)) * 10.0}))
+    context = EffectContext(model.chain, model.values, replace(rows, extra={"time_s": np.arange(len(rows)) * 10.0}))
     found = []
     for name, where in parse_effects(effects, session.rig):
         family = library()[name]
-        settings = family.variants(situation, where)[-1]
-        sigma = np.array([c.sigma for c in family.coefficients(situation, where, settings)])
-        found.append(Choice(name, where, settings).fitted(situation, sigma, 0.1 * sigma))
+        settings = family.variants(context, where)[-1]
+        sigma = np.array([c.sigma for c in family.coefficients(context, where, settings)])
+        found.append(Choice(name, where, settings).fitted(context, sigma, 0.1 * sigma))
     covariance = np.zeros((len(model.values) + sum(len(effect.coefficients) for effect in found),) * 2)
     return replace(model, effects=tuple(found), covariance=covariance)
 

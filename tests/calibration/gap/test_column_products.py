@@ -39,7 +39,7 @@ def shared() -> Projection:
 
 
 def candidates(over: Projection) -> list[CandidateEffect]:
-    return [candidate_at(over.situation, over, *name, variants_at(over.situation, *name)) for name in NAMES]
+    return [candidate_at(over.context, over, *name, variants_at(over.context, *name)) for name in NAMES]
 
 
 def test_products_are_those_of_the_projected_columns(shared: Projection) -> None:
@@ -96,8 +96,8 @@ def test_a_part_of_the_data_is_weighed_as_its_rows_are(shared: Projection) -> No
 
 
 def test_curves_are_made_once_for_all_fits(shared: Projection) -> None:
-    first = candidate_effects(shared.situation, shared, ["joint_error_map", "joint_compliance"]).candidates
-    again = candidate_effects(shared.situation, shared, ["joint_error_map", "joint_compliance"], like=first).candidates
+    first = candidate_effects(shared.context, shared, ["joint_error_map", "joint_compliance"]).candidates
+    again = candidate_effects(shared.context, shared, ["joint_error_map", "joint_compliance"], like=first).candidates
     for own, other in zip(first, again, strict=True):
         for a, b in zip(own.additions, other.additions, strict=True):
             assert a.has_columns_of(b)

@@ -151,7 +151,7 @@ def test_thirty_signals_that_have_nothing_to_do_with_it_raise_no_alarm() -> None
 def test_what_a_size_depends_on_is_asked_beside_the_error_itself() -> None:
     """A fitted size is shrunk: along the error there is always something left, and what hardly varies goes with it."""
     projection = grammar("").projection
-    joint = projection.situation.chain.joint_index["theta5"]
+    joint = projection.context.chain.joint_index["theta5"]
     place = ErrorSource("theta5", "its error", {}, projection.joint_jacobian[:, :, joint])
     itself = projection.columns(place.moved_mm[:, :, None])[:, 0]
     terms = modulations(projection, place)
@@ -217,7 +217,7 @@ def test_a_term_shows_no_more_beside_the_effect_of_the_library_behind_it_but_bes
     projection = words.projection
 
     def adds_to(family: str, where: str) -> bool:
-        additions = Choice(family, where, {}, scale=10.0).columns(projection.situation)
+        additions = Choice(family, where, {}, scale=10.0).columns(projection.context)
         additions = additions.over(projection.samples.average)
         columns = projection.columns(projection.moved_mm(additions)) * additions.prior_sigma
         return first.adds_to(columns, projection.residual)
@@ -294,7 +294,7 @@ def test_the_same_draws_find_the_same() -> None:
 
 def test_a_screen_keeps_products_of_columns_and_not_the_columns() -> None:
     over = projected(shipped_rig("swdt82"), measured(shipped_rig("swdt82"), "", 2))
-    places = candidate_effects(over.situation, over, library()).candidates
+    places = candidate_effects(over.context, over, library()).candidates
     tracemalloc.start()
     try:
         screen = Screen(over, places)

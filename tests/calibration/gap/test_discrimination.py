@@ -53,7 +53,7 @@ class Measured:
     solution: Solution
 
     @property
-    def situation(self) -> EffectContext:
+    def context(self) -> EffectContext:
         chain = self.solution.chain
         return EffectContext(chain, self.solution.fit.x[: len(chain)], self.observations)
 
@@ -64,8 +64,8 @@ class Measured:
         return build_model(self.truth.rig, text, self.observations, adopted, "recalibration", {"seed": 0})
 
     def screen(self, *families: str) -> Screen:
-        projection = Projection(self.solution, self.situation)
-        return Screen(projection, candidate_effects(self.situation, projection, families).candidates)
+        projection = Projection(self.solution, self.context)
+        return Screen(projection, candidate_effects(self.context, projection, families).candidates)
 
     def evidence(self, *effects: str) -> dict[str, ScoredEffect]:
         scored = self.screen(*{effect.partition("@")[0] for effect in effects}).score()
@@ -73,14 +73,14 @@ class Measured:
 
     def found(self, *effects: str) -> list[list[FittedEffect]]:
         by_name = self.evidence(*effects)
-        return [[by_name[effect].fitted(self.situation)] for effect in effects]
+        return [[by_name[effect].fitted(self.context)] for effect in effects]
 
     def in_form(self, effect: str, settings: Settings) -> list[FittedEffect]:
         """As the data have it, if it is of this form."""
         family, _, where = effect.partition("@")
-        projection = Projection(self.solution, self.situation)
-        place = candidate_at(self.situation, projection, family, where, [Choice(family, where, settings)])
-        return [w.fitted(self.situation) for w in Screen(projection, [place]).score()]
+        projection = Projection(self.solution, self.context)
+        place = candidate_at(self.context, projection, family, where, [Choice(family, where, settings)])
+        return [w.fitted(self.context) for w in Screen(projection, [place]).score()]
 
 
 def measure(truth: RigTruth, poses: dict[str, Floats], seed: int) -> Observations:
@@ -250,14 +250,14 @@ def test_a_plan_varies_what_changes_one_effect_and_not_the_other(short: Measured
 def test_a_plan_waits_only_where_time_tells(short: Measured) -> None:
     times = np.linspace(0.0, 28800.0, len(short.observations))
     timed = replace(short.observations, extra=dict(short.observations.extra) | {"time_s": times})
-    situation = replace(short.situation, observations=timed)
+    context = replace(short.context, observations=timed)
     hours = {}
     for pair in (("transducer_index_jump@L3", "transducer_cumulative@L3"), ("base_settlement@base", "base_step@base")):
         alternatives: list[list[FittedEffect]] = []
         for name, _, where in (effect.partition("@") for effect in pair):
-            settings = library()[name].variants(situation, where)[0]
-            sigma = np.array([c.sigma for c in library()[name].coefficients(situation, where, settings)])
-            alternatives.append([Choice(name, where, settings).fitted(situation, sigma, 0.1 * sigma)])
+            settings = library()[name].variants(context, where)[0]
+            sigma = np.array([c.sigma for c in library()[name].coefficients(context, where, settings)])
+            alternatives.append([Choice(name, where, settings).fitted(context, sigma, 0.1 * sigma)])
         proposed, *_ = propose_experiments(short.model, timed, alternatives, np.random.default_rng(0), poses=8)
         taken = np.array([float(str(row["time_s"])) for row in proposed.poses])
         hours[pair[0]] = float(np.ptp(taken)) / 3600.0
@@ -352,10 +352,10 @@ def of_plausible_size(case: Measured, effect: str) -> FittedEffect:
     knowledge = Knowledge.before(case.model, 0)
     at = site(case.model.chain, case.model.values, setup=0)
     poses = draw(knowledge, at, np.random.default_rng(1), 30)
-    situation = knowledge.context(poses.readings, poses.conditions)
-    settings = library()[name].variants(situation, where)[0]
-    sigma = np.array([c.sigma for c in library()[name].coefficients(situation, where, settings)])
-    return Choice(name, where, settings).fitted(situation, sigma, 0.1 * sigma)
+    context = knowledge.context(poses.readings, poses.conditions)
+    settings = library()[name].variants(context, where)[0]
+    sigma = np.array([c.sigma for c in library()[name].coefficients(context, where, settings)])
+    return Choice(name, where, settings).fitted(context, sigma, 0.1 * sigma)
 
 
 @pytest.mark.long

@@ -64,7 +64,7 @@ def bare() -> Projection:
 
 def moved(projection: Projection, choice: Choice, values: tuple[float, ...]) -> Floats:
     """(n, 3) what an effect does to the fixes, mm."""
-    shift: Floats = projection.moved_mm(choice.columns(projection.situation)) @ np.array(values)
+    shift: Floats = projection.moved_mm(choice.columns(projection.context)) @ np.array(values)
     return shift
 
 
@@ -82,29 +82,29 @@ def moved(projection: Projection, choice: Choice, values: tuple[float, ...]) -> 
 def test_the_data_tell_the_form_and_the_coefficients_go_with_it(
     bare: Projection, family: str, where: str, values: tuple[float, ...], number: int
 ) -> None:
-    forms = variants_at(bare.situation, family, where)
+    forms = variants_at(bare.context, family, where)
     shown = projected(moved(bare, forms[number], values))
-    found = Screen(shown, [candidate_at(shown.situation, shown, family, where, forms)]).score()[0]
+    found = Screen(shown, [candidate_at(shown.context, shown, family, where, forms)]).score()[0]
     assert found.choice.settings == forms[number].settings
     assert (np.abs(found.estimate - values) < 3.5 * found.standard_error).all()
 
 
 def test_over_less_than_half_a_turn_an_encoder_errs_once_or_twice_a_turn_but_not_both(bare: Projection) -> None:
-    forms = variants_at(bare.situation, "encoder_harmonic", "theta7")
+    forms = variants_at(bare.context, "encoder_harmonic", "theta7")
     assert [form.settings for form in forms] == [{"k": 1.0}, {"k": 2.0}]
 
 
 def test_the_clearance_of_pads_is_as_open_as_what_they_overlap(bare: Projection) -> None:
-    forms = variants_at(bare.situation, "pad_play", "boom")
+    forms = variants_at(bare.context, "pad_play", "boom")
     hidden = next(form for form in forms if form.settings["left"] == pytest.approx(0.2))
     shown = projected(moved(bare, hidden, (5.0,)))
-    screen = Screen(shown, [candidate_at(shown.situation, shown, "pad_play", "boom", forms)])
+    screen = Screen(shown, [candidate_at(shown.context, shown, "pad_play", "boom", forms)])
     probability = softmax([screen.log_bayes_factor([(0, option)]) for option in range(len(forms))])
-    between = library()["pad_play"].settled([form.settings for form in forms], probability)
+    between = library()["pad_play"].posterior_settings([form.settings for form in forms], probability)
     assert abs(np.log(between["left"] / 0.2)) < 3.0 * between["left_spread"] < 1.5
     choice = replace(hidden, settings=between)
-    found = Screen(shown, [candidate_at(shown.situation, shown, "pad_play", "boom", [choice])]).score()[0]
-    told = choice.fitted(shown.situation, found.estimate, found.standard_error).reported[0]
+    found = Screen(shown, [candidate_at(shown.context, shown, "pad_play", "boom", [choice])]).score()[0]
+    told = choice.fitted(shown.context, found.estimate, found.standard_error).reported[0]
     assert told.standard_error > 2.0 * found.standard_error[0]
     assert abs(told.value - 5.0) < 2.5 * told.standard_error
 
@@ -114,9 +114,9 @@ def test_of_forms_that_mirror_each_other_the_one_within_its_limits_is_taken(
     bare: Projection, sign: float, option: int
 ) -> None:
     """Where the load always lifts a joint's value, both forms of a leak explain as much, one of them with -rate."""
-    falls = variants_at(bare.situation, "leak_down", "theta6")[0]
+    falls = variants_at(bare.context, "leak_down", "theta6")[0]
     shown = projected(sign * moved(bare, falls, (4e-5,)))
-    both = candidate_at(shown.situation, shown, "leak_down", "theta6", [falls, falls])
+    both = candidate_at(shown.context, shown, "leak_down", "theta6", [falls, falls])
     upwards = replace(both.additions[1], column=-both.additions[1].column)
     found = Screen(shown, [replace(both, additions=(both.additions[0], upwards))]).score()[0]
     assert found.option == option
@@ -132,7 +132,7 @@ def test_the_base_tilts_about_level_axes_wherever_its_own_point(bare: Projection
     assert np.linalg.det(leaning) == pytest.approx(1.0)
     assert leaning[2] @ np.array([0.3, -0.2, -0.9]) < 0.0
     # A rise is a rise in the station's frame, which is level, and tilts leave the origin's vertical alone.
-    rise = bare.situation.base_motion_mm(np.ones(FIXES))[:, :, 2]
+    rise = bare.context.base_motion_mm(np.ones(FIXES))[:, :, 2]
     assert (rise[:, 2] > np.cos(np.radians(2.0))).all()
 
 
@@ -163,20 +163,20 @@ def test_noise_chooses_no_neighbours_of_a_prism_that_stands_still() -> None:
 def test_an_effect_beside_others_is_weighed_as_all_together_are(bare: Projection) -> None:
     """The others are factored once; their products with an effect are what is left to do for each of its forms."""
     names = [("leak_down", "theta6"), ("encoder_harmonic", "theta7"), ("base_settlement", "base")]
-    places = [candidate_at(bare.situation, bare, *name, variants_at(bare.situation, *name)) for name in names]
+    places = [candidate_at(bare.context, bare, *name, variants_at(bare.context, *name)) for name in names]
     screen = Screen(bare, places)
     chosen = {0: (0, 1.0), 2: (1, 3.0)}
-    beside = screen.beside(chosen)
-    assert beside.log_bayes_factor == pytest.approx(screen.log_bayes_factor([(0, 0), (2, 1)], [1.0, 3.0]))
+    given = screen.given(chosen)
+    assert given.log_bayes_factor == pytest.approx(screen.log_bayes_factor([(0, 0), (2, 1)], [1.0, 3.0]))
     for option in range(2):
         together = screen.log_bayes_factor([(0, 0), (2, 1), (1, option)], [1.0, 3.0, 10.0])
-        assert beside.together(1, option, 10.0) == pytest.approx(together)
-    assert screen.beside({}).log_bayes_factor == 0.0
-    assert screen.beside({}).together(1, 0, 1.0) == pytest.approx(screen.log_bayes_factor([(1, 0)]))
+        assert given.together(1, option, 10.0) == pytest.approx(together)
+    assert screen.given({}).log_bayes_factor == 0.0
+    assert screen.given({}).together(1, 0, 1.0) == pytest.approx(screen.log_bayes_factor([(1, 0)]))
 
 
 def test_forms_that_differ_in_their_prior_alone_share_their_columns(bare: Projection) -> None:
-    forms = variants_at(bare.situation, "joint_error_map", "theta7")
-    first, second = candidate_at(bare.situation, bare, "joint_error_map", "theta7", forms).additions[:2]
+    forms = variants_at(bare.context, "joint_error_map", "theta7")
+    first, second = candidate_at(bare.context, bare, "joint_error_map", "theta7", forms).additions[:2]
     assert first.has_columns_of(second)
     assert (first.prior_sigma < second.prior_sigma).all()

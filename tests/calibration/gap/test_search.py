@@ -90,7 +90,8 @@ def test_what_is_too_large_for_its_name_is_not_said_to_be_outside_of_the_library
     gap = find_gap(SOURCE.rig, SOURCE.text, parse_observations(data, SOURCE.rig, "session.csv"))
     assert (gap.verdict, gap.effects) == ("unidentified", ())
     assert gap.description is not None
-    assert gap.description.endswith("transducer_scale@L2 would do this, but scale would be beyond what is physical")
+    reason = "transducer_scale@L2 would explain this, but scale would exceed its physical limits"
+    assert gap.description.endswith(reason)
 
 
 @pytest.mark.long

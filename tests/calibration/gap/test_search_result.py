@@ -31,7 +31,7 @@ def test_what_has_no_name_is_told(cell: Cell, words: str) -> None:
     assert drawn is not None
     model = identify(SOURCE.rig, SOURCE.text, parse_observations(drawn.train.encode(), SOURCE.rig, "case.csv"))
     assert not model.effects
-    told = [w for w in model.warnings if w.startswith(("the data ask for", "the kinematics leave more than noise"))]
+    told = [w for w in model.warnings if w.startswith(("the data require", "the kinematics leave more than noise"))]
     assert len(told) == bool(words)
     assert words in "".join(told)
 

@@ -206,7 +206,7 @@ def test_a_fifth_of_gross_outliers_does_not_hurt(session: Session, size_mm: floa
     fit = refine(chain, samples, start.x)
     held = session.held_out
     floor = rms(held.position_mm - Predictor.of(session.model).geometric_mm(held))
-    assert fit.settled
+    assert fit.converged
     assert rms(held.position_mm - chain.positions_mm(fit.x, chain.bind(held))) < 1.03 * floor
     far = np.linalg.norm(position[bad] - session.training.position_mm[bad], axis=1) > 40.0
     assert fit.weight[bad[far]].max() < 0.5

@@ -186,7 +186,7 @@ def test_a_fifth_of_gross_outliers_among_whole_poses_does_not_hurt(session: Sess
     for rows in (table, replace(table, position_mm=position)):
         chain, samples, start = place(session.rig, rows)
         fit = refine(chain, samples, start.x)
-        assert fit.settled
+        assert fit.converged
         errors.append(rms(held.position_mm - chain.positions_mm(fit.x, chain.bind(held))))
     assert errors[1] < 1.03 * errors[0]
     assert fit.weight[bad].max() < 0.5

@@ -49,7 +49,7 @@ def test_an_effect_of_the_library_that_is_too_weak_to_be_named_is_not_said_to_be
     assert gap.verdict != "none"
     assert "not in the library" not in (gap.description or "")
     if gap.verdict == "unidentified":
-        assert "base_settlement@base would do this, but" in (gap.description or "")
+        assert "base_settlement@base would explain this, but" in (gap.description or "")
 
 
 def test_a_load_beyond_those_of_the_training_is_doubtful_for_every_effect_that_goes_with_it() -> None:
@@ -72,7 +72,7 @@ def test_rates_and_torques_that_no_machine_has_neither_name_anything_nor_end_the
     gap = find_gap(massless, support.SOURCE.text, replace(rows, extra={**unmeasured, **wild}))
     assert gap.verdict == "none"
     assert any("too large ones make a loose fit" in warning for warning in gap.warnings)
-    assert gap.disabled["joint_compliance"] == "these poses show nothing of it"
+    assert gap.disabled["joint_compliance"] == "it has no effect in these poses"
 
 
 def test_time_does_not_run_backwards_while_a_machine_stands() -> None:

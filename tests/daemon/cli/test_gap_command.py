@@ -185,7 +185,7 @@ def test_places_and_plausible_sizes_are_those_of_the_rig() -> None:
 def test_one_effect_is_told_in_full_and_a_misspelt_one_refused() -> None:
     told = run("effects", "backlash")
     assert told.exit_code == 0
-    for words in ("width_rad", "confused with: load_hysteresis", "coming to the same pose", "the column <joint>_dir"):
+    for words in ("width_rad", "confused with: load_hysteresis", "approaching the same pose", "the column <joint>_dir"):
         assert words in told.stdout
     refused = run("effects", "backslash")
     assert refused.exit_code == 2

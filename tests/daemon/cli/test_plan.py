@@ -70,7 +70,7 @@ def test_people_get_a_table_that_is_not_cut_and_sentences() -> None:
         "95 %",
         "Assumed",
         "reachable:",
-        "too few: to calibrate, 32 parameters",
+        "too few: calibrating 32 parameters",
     ):
         assert text in result.stdout
     assert "…" not in result.stdout

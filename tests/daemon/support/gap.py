@@ -52,7 +52,7 @@ def named() -> GapResult:
         remaining_mm=0.4,
         disabled={
             "thermal_expansion": "needs the column temperature_degC",
-            "latency": "these poses show nothing of it",
+            "latency": "it has no effect in these poses",
         },
         before_mm=rms(before),
         after_mm=rms(after),

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.optimize import check_grad
 from scipy.stats import multivariate_normal
 
-from calibration.gap.background.evidence import FixedAndScaled, Products, greatest
+from calibration.gap.background.evidence import FixedAndScaled, Products, maximise_evidence
 
 Floats = NDArray[np.float64]
 
@@ -54,7 +54,7 @@ def test_its_slopes_are_those_of_its_values(fixed: int) -> None:
 def test_scales_of_what_is_there_are_found_and_those_of_what_is_not_vanish() -> None:
     own = products(*problem(3, (2.0, 0.0, 0.5)))
     blocks = {"there": np.arange(2, 7), "not there": np.arange(7, 12)}
-    found = greatest(own, np.arange(2), np.ones(2), blocks, dict.fromkeys(blocks, -1.0), 1.0, 1e-3)
+    found = maximise_evidence(own, np.arange(2), np.ones(2), blocks, dict.fromkeys(blocks, -1.0), 1.0, 1e-3)
     assert 1.0 < np.exp(found.log_scale["there"]) < 4.0
     assert np.exp(found.log_scale["not there"]) < 0.1
     assert found.noise == pytest.approx(0.25, rel=0.3)

@@ -9,7 +9,7 @@ import pytest
 
 from calibration.gap.background.blocks import smooth_blocks
 from calibration.gap.background.reading_noise import with_reading_noise
-from calibration.gap.background.search import search_beside
+from calibration.gap.background.search import search_given_background
 from calibration.gap.background.weights import reweighted
 from calibration.gap.joint_fit import Problem
 from calibration.identification.samples import averaged
@@ -49,7 +49,7 @@ def test_a_gross_outlier_is_weighted_out_and_the_others_are_not() -> None:
     position[7] += 60.0
     own = problem(replace(rows, position_mm=position))
     joint = own.with_mild_outliers(own.kinematics_only())
-    fit, scales = reweighted(own, joint, smooth_blocks(joint.situation, own.solution.samples.average), (), None)
+    fit, scales = reweighted(own, joint, smooth_blocks(joint.context, own.solution.samples.average), (), None)
     assert fit.weight[own.solution.samples.of_row[7]] < 0.01
     assert (fit.weight < 0.5).sum() == 1
     assert set(scales.blocks)
@@ -62,7 +62,7 @@ def test_reading_errors_that_prisms_share_are_found_at_their_joint() -> None:
     joints = {**rows.joints, "theta3": rows.joints["theta3"] + error}
     own = problem(replace(rows, joints=joints))
     joint = own.with_mild_outliers(own.kinematics_only())
-    system, model = search_beside(own, joint, (), ("angle_scale",), ())
+    system, model = search_given_background(own, joint, (), ("angle_scale",), ())
     sigma = {j.name: j.sigma for j in with_reading_noise(own, system, model).solution.chain.rig.joints}
     assert sigma["theta3"] == pytest.approx(0.2, rel=0.4)
     assert all(sigma[j.name] < 0.1 for j in RIG.joints if j.kind == "revolute" and j.name != "theta3")

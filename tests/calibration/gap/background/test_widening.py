@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from calibration.gap.background.blocks import Block, possible_blocks, smooth_blocks
-from calibration.gap.background.search import search_beside
+from calibration.gap.background.search import search_given_background
 from calibration.gap.background.system import Model, System
 from calibration.gap.background.widening import further_blocks
 from calibration.gap.joint_fit import Problem
@@ -28,8 +28,8 @@ def beside_smooth(*effects: Effect) -> tuple[System, Model, list[Block]]:
     own = Problem(solve(RIG, rows, prior="recalibration", run=DEFAULT_RUN), rows, "recalibration", 0)
     joint = own.with_mild_outliers(own.kinematics_only())
     average = own.solution.samples.average
-    found = search_beside(own, joint, smooth_blocks(joint.situation, average), ("angle_scale",), ())
-    return *found, list(possible_blocks(joint.situation, average))
+    found = search_given_background(own, joint, smooth_blocks(joint.context, average), ("angle_scale",), ())
+    return *found, list(possible_blocks(joint.context, average))
 
 
 def test_an_error_that_two_distant_joints_decide_is_taken_into_the_background() -> None:

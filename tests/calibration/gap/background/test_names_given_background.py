@@ -124,7 +124,7 @@ def test_what_makes_outliers_of_many_fixes_is_judged_with_these(share: float, ha
     rows = replace(rows, joints={**rows.joints, "q3": rows.joints["q3"] - step_deg})
     solution = solve(RIG, rows, prior="recalibration", run=Run(0))
     problem = Problem(solution, rows, "recalibration", 0)
-    forms = variants_at(problem.kinematics_only().situation, "zero_step", "q3")
+    forms = variants_at(problem.kinematics_only().context, "zero_step", "q3")
     step = min(forms, key=lambda form: abs(form.settings["time_s"] - 79.5))
     joint = problem.fit([step], solution.fit.x)
     outliers = joint.fit.weight < 0.5

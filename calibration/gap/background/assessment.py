@@ -1,7 +1,7 @@
-"""Judgement of every effect of a model given all others: its evidence, its alternatives, and where it may be.
+"""Assessment of every effect of a model given all others: its evidence, its alternatives, and its possible places.
 
-The order in which effects are found matters to none of this: each is left out in turn, the background takes what it
-can, and everything in the library competes for what is missing then.
+The result does not depend on the order in which effects were found. Each effect is left out in turn, the background is
+fitted again, and all effects of the library compete to replace it.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from calibration.gap.background.blocks import Block
 from calibration.gap.background.search import (
     ODDS,
     Gain,
+    add_certain_effects,
     gain,
-    grown,
     is_beyond_limits,
     is_curve,
     log_prior,
@@ -28,29 +28,29 @@ from calibration.gap.background.search import (
 from calibration.gap.background.system import Chosen, Model, System
 from calibration.gap.screening import ScoredEffect
 
-_CERTAIN = 0.95  # posterior of a family
-_OPEN = 0.02  # posterior of another family
+_CERTAIN = 0.95  # posterior from which on a family is certain
+_OPEN = 0.02  # posterior from which on a different family is a possible alternative
 _ROUNDS = 5
-_BETTER = 1.0  # log odds, to take one effect for another
+_BETTER = 1.0  # log odds required to replace one effect by another
 _COMPARED = 8
-_BY_SCALES = 20.0  # log Bayes factor that other scales of the background may add
-NEAR = 5.0  # log Bayes factor: places and families this near are not told apart
-_NOT_TOLD = math.exp(-NEAR)
-_DOMINATES = 4.0  # squares of a curve, of those of surfaces at its joint
+_BY_SCALES = 20.0  # log Bayes factor that refitting the scales of the background may add
+NEAR = 5.0  # difference of log Bayes factors below which places and families are not distinguishable
+_INDISTINGUISHABLE = math.exp(-NEAR)
+_DOMINATES = 4.0  # required ratio of a curve's sum of squares to that of the surfaces at its joint
 
 
 @dataclass(frozen=True)
-class Judged:
-    """An effect of a model, judged given all others.
+class Assessment:
+    """An effect of a model, assessed given all others.
 
     Attributes:
         effect: the effect.
-        scored: the same, beside the model without it.
-        log_bayes_factor: against the model without it.
-        log_odds: the same with prior odds.
-        posterior: probability of its family.
-        places: place -> probability that it is there, given the family; those that are possible.
-        alternatives: of other families, where these are possible.
+        scored: its score given the model without it.
+        log_bayes_factor: log Bayes factor against the model without the effect.
+        log_odds: the same including prior odds.
+        posterior: posterior probability of the family.
+        places: possible place -> its posterior probability, given the family.
+        alternatives: possible effects of other families.
     """
 
     effect: Chosen
@@ -63,62 +63,66 @@ class Judged:
 
     @property
     def is_certain(self) -> bool:
-        """True if the family is beyond doubt."""
+        """True if the family is certain."""
         return self.posterior >= _CERTAIN
 
 
-def judged(system: System, model: Model) -> tuple[Model, list[Judged]]:
-    """Return a model in which every effect is the most probable given all others, and the judgement of each.
+def assess_model(system: System, model: Model) -> tuple[Model, list[Assessment]]:
+    """Return a model in which every effect is the most probable given all others, and the assessment of each.
 
-    Where an effect had to go, the search goes on beside those that are left.
+    Where an effect is removed, the search continues with the remaining ones.
+
+    Args:
+        system: the linear model of the data.
+        model: effects and scales to start from.
     """
     seen = set[frozenset[tuple[int, int]]]()
     for _ in range(_ROUNDS):
         before, effects = model, frozenset(effect[:2] for effect in model.effects)
-        if effects in seen:  # no set holds: each is judged worse than another of them
+        if effects in seen:  # a cycle: no set of effects is stable
             break
         seen.add(effects)
-        found: list[Judged] = []
+        found: list[Assessment] = []
         for effect in before.effects:
             if effect not in model.effects:
                 continue
             alternatives = _Alternatives(system, model, model.effects.index(effect))
             changed = alternatives.changed()
             model = model if changed is None else changed
-            found += [] if changed is not None else [alternatives.judgement()]
-        model = grown(system, model)
+            found += [] if changed is not None else [alternatives.assessment()]
+        model = add_certain_effects(system, model)
         if len(found) == len(before.effects) == len(model.effects):
             return model, found
-    return model, judgements(system, model)
+    return model, assessments(system, model)
 
 
-def judgements(system: System, model: Model) -> list[Judged]:
-    """Return the judgement of every effect of a model that stays as it is."""
-    return [_Alternatives(system, model, number).judgement() for number in range(len(model.effects))]
+def assessments(system: System, model: Model) -> list[Assessment]:
+    """Return the assessment of every effect of an unchanged model."""
+    return [_Alternatives(system, model, number).assessment() for number in range(len(model.effects))]
 
 
 class _Alternatives:
-    """An effect of a model, and all that could be in its place."""
+    """An effect of a model, and the candidates that could replace it."""
 
     def __init__(self, system: System, model: Model, number: int) -> None:
         self.system, self.model = system, model
         self.effect, self.rest = model.effects[number], model.without(number)
         self.candidate = system.candidates[self.effect[0]]
         self.without = system.fit(self.rest, model.scales)
-        # Scores at the scales of the whole: found again without the effect, a background takes what it can of it.
-        beside = system.at(self.rest, model.scales)
-        every = system.screen(beside).score()
+        # Scores use the scales of the full model. Refitted without the effect, the background would absorb part of it.
+        given = system.at(self.rest, model.scales)
+        every = system.screen(given).score()
         own = self._own(next(w for w in every if w.candidate is self.candidate))
         self.temper = temper(system, model, self.candidate, own.log_bayes_factor)
         least = own.scored.log_bayes_factor - NEAR * self.temper - _BY_SCALES
-        near = [w for w in promising(system, beside, every) if w.log_bayes_factor > least]
+        near = [w for w in promising(system, given, every) if w.log_bayes_factor > least]
         others = [w for w in near if w.candidate is not self.candidate][:_COMPARED]
         self.gains = [own, *(gain(system, self.without, w, model.scales) for w in others)]
-        # A prior probability counts between a candidate and nothing; between families it is that of their places.
+        # The prior of a candidate against no effect is not used here; families compete with the prior of their places.
         self.odds = [(g.log_bayes_factor - math.log(_places(system, g))) / self.temper for g in self.gains]
 
     def _own(self, scored: ScoredEffect) -> Gain:
-        """Return what the effect gains, in its present form or in that which is the best one now."""
+        """Return the gain by the effect, in its present variant or in the one that is best now."""
         odds = log_prior(self.system, self.without, self.candidate)
         best = self.model.log_evidence - self.without.log_evidence
         there = best + scored.form_averaging
@@ -129,7 +133,7 @@ class _Alternatives:
         return again if again.log_likelihood_gain > best else own
 
     def changed(self) -> Model | None:
-        """Return the model without the effect where it is not needed, with a better one where there is one, or None."""
+        """Return a model without the effect if not needed, or with a better effect; None if it is to be kept."""
         best = max(range(len(self.gains)), key=self.odds.__getitem__)
         if not self._is_needed() or is_beyond_limits(self.system, self.model, self.gains[0].scored):
             return self.system.fit(self.rest, self.without.scales)
@@ -139,7 +143,7 @@ class _Alternatives:
         return None
 
     def _is_needed(self) -> bool:
-        """True if the effect is beyond doubt: beside all others, and where a curve can imitate it against nothing."""
+        """Return True if the effect is certain given all others; if a curve can imitate it, also against no effect."""
         own = self.gains[0]
         if own.log_odds < needed(self.system, self.without, self.candidate):
             return False
@@ -148,15 +152,15 @@ class _Alternatives:
         bare = self.system.fit(self.rest, self.model.scales, without={f"curve({self.candidate.where})"})
         return own.model.log_evidence - bare.log_evidence - math.log(len(self.system.candidates)) > ODDS
 
-    def judgement(self) -> Judged:
-        """Return the judgement of the effect."""
+    def assessment(self) -> Assessment:
+        """Return the assessment of the effect."""
         share = softmax([*self.odds, 0.0])
         same = [n for n, g in enumerate(self.gains) if g.scored.candidate.family == self.candidate.family]
-        # How large an effect would be at another place is no evidence against that place.
+        # The size of the effect at a place does not count as evidence against that place.
         at_best = softmax([self.gains[n].log_likelihood_gain / self.temper for n in same])
         places = {self.gains[n].scored.candidate.where: float(p) for n, p in zip(same, at_best, strict=True)}
-        least = places[self.candidate.where] * _NOT_TOLD
-        return Judged(
+        least = places[self.candidate.where] * _INDISTINGUISHABLE
+        return Assessment(
             self.effect,
             self.gains[0].scored,
             self.gains[0].log_bayes_factor,
@@ -172,10 +176,14 @@ def _places(system: System, gain: Gain) -> int:
 
 
 def curves(system: System, model: Model) -> dict[str, float]:
-    """Return the joints whose curve is beyond doubt and no part of a surface, the largest first, with its log odds.
+    """Return joint -> log odds of its curve, for curves that are certain and not part of a surface, largest first.
 
-    A smooth error that depends on several angles has a part that depends on each alone: a curve is a joint's own where
-    it is much larger than the surfaces at this joint. And another effect at the joint may be what a curve imitates.
+    A smooth error of several angles has parts that depend on each angle alone. A curve is therefore attributed to the
+    joint only if it is much larger than the surfaces at this joint, and if no other effect at the joint explains it.
+
+    Args:
+        system: the linear model of the data.
+        model: effects and scales.
     """
     amounts = system.amounts(model)
     size = {
@@ -198,7 +206,7 @@ def curves(system: System, model: Model) -> dict[str, float]:
 
 
 def _is_imitated(system: System, without: Model, curve: Block, added: float) -> bool:
-    """True if another effect at its joint does nearly what a curve adds to a model that lacks it."""
+    """Return True if a different effect at the joint adds nearly the same evidence as a curve to a model without it."""
     every = promising(system, without, system.screen(without).score())
     for scored in [w for w in every if w.candidate.where == curve.where][:_COMPARED]:
         near = added - NEAR * temper(system, without, scored.candidate, added)
