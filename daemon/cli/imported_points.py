@@ -20,9 +20,9 @@ from calibration.rig.toml import parse_toml, quoted
 from calibration.rig.toml_errors import place, reason
 from drivers.errors import DescriptionError
 from drivers.files import read_whole
-from drivers.stations.cells import cells_of, lines_of, number_of
 from drivers.stations.export_format import ColumnMap, ExportedFix, refuse
 from drivers.stations.exports import export_formats
+from drivers.stations.tables.cells import cells_of, lines_of, number_of
 
 FILE_MAX_BYTES = 128 << 20
 REPEATED_MM = 10.0  # a point that is measured again is nearer to itself

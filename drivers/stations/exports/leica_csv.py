@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 
-from drivers.stations.delimited import delimited_format
+from drivers.stations.tables.delimited import delimited_format
 
 _MARKS = re.compile(r"\b(leica|hexagon|captivate|infinity|emscon|axyz|pt ?id|point ?id)\b", re.IGNORECASE)
 

@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from drivers.stations.delimited import delimited_format
+from drivers.stations.tables.delimited import delimited_format
 
 FORMAT = delimited_format("plain_csv", "table of points", 90, lambda text: bool(text.strip()))

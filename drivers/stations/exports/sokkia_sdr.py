@@ -24,7 +24,6 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
-from drivers.stations.cells import lines_of, number_of, why_no_number
 from drivers.stations.export_format import (
     MM_PER,
     RAD_PER,
@@ -37,6 +36,7 @@ from drivers.stations.export_format import (
     polar_position_mm,
     refuse,
 )
+from drivers.stations.tables.cells import lines_of, number_of, why_no_number
 
 _CODE, _WIDTH = 4, 16
 _MARKS = "\ufeff\r\n\x02 "  # allowed before the first record

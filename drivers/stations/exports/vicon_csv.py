@@ -16,8 +16,17 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 
-from drivers.stations.cells import WHOLE, Numbers, cells_of, decimal_of, line_at, lines_of, number_of, why_too_many
 from drivers.stations.export_format import MM_PER, ColumnMap, ExportedFix, ExportFormat, Guess, refuse
+from drivers.stations.tables.cells import (
+    WHOLE,
+    Numbers,
+    cells_of,
+    decimal_of,
+    line_at,
+    lines_of,
+    number_of,
+    why_too_many,
+)
 
 _KINDS = {"objects", "devices", "joints", "segments", "model outputs"}
 

@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterator, Sequence
 
 from drivers.stations.export_format import refuse
-from drivers.stations.named_units import ANGLES, LENGTHS, Quantity
+from drivers.stations.tables.named_units import ANGLES, LENGTHS, Quantity
 
 _UNIT_WORD = re.compile(r"\b(?:units?|\w*einheit(?:en)?)\b")
 _SAID = re.compile(r"""(?P<of>(?:\s+used|\s+of\s+\w+)?)[\s\])"]*(?:[:=;,\t\[(]|\b(?:is|are|in)\b)(?P<said>[^;\t]*)""")

@@ -6,11 +6,11 @@ import math
 from collections.abc import Mapping
 from datetime import datetime
 
-from drivers.stations.cells import WHOLE, cells_of, decimal_of, is_no_row, lines_of, number_of, why_too_many
 from drivers.stations.export_format import ColumnMap, Guess, Role, refuse
-from drivers.stations.named_units import ANGLES, LENGTHS, check_seconds, unit_of_columns
-from drivers.stations.table_columns import CARTESIAN, POLAR, one_of_each, roles_of_cells
-from drivers.stations.units_above import unit_of_preamble
+from drivers.stations.tables.cells import WHOLE, cells_of, decimal_of, is_no_row, lines_of, number_of, why_too_many
+from drivers.stations.tables.columns import CARTESIAN, POLAR, one_of_each, roles_of_cells
+from drivers.stations.tables.named_units import ANGLES, LENGTHS, check_seconds, unit_of_columns
+from drivers.stations.tables.units_above import unit_of_preamble
 
 _SEPARATORS = (";", "\t", ",", " ")
 _HEAD_LINES = 200  # longest preamble

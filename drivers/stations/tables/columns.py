@@ -6,7 +6,7 @@ import re
 from collections.abc import Mapping, Sequence
 
 from drivers.stations.export_format import Role, refuse
-from drivers.stations.named_units import bracket_words, without_unit
+from drivers.stations.tables.named_units import bracket_words, without_unit
 
 _NAMES: Mapping[Role, str] = {
     "point": "point pointname pointid pointnumber pointno ptid ptno pt pid name id label no nr pose punkt punktnr "

@@ -7,16 +7,6 @@ from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
 from typing import NoReturn
 
-from drivers.stations.cells import (
-    Numbers,
-    cells_of,
-    is_no_row,
-    line_at,
-    lines_of,
-    number_of,
-    why_too_few,
-    why_too_many,
-)
 from drivers.stations.export_format import (
     MM_PER,
     RAD_PER,
@@ -28,9 +18,19 @@ from drivers.stations.export_format import (
     polar_position_mm,
     refuse,
 )
-from drivers.stations.named_units import mm_of
-from drivers.stations.table_columns import CARTESIAN, POLAR
-from drivers.stations.table_guess import CLOCK_FORMATS, guess_table
+from drivers.stations.tables.cells import (
+    Numbers,
+    cells_of,
+    is_no_row,
+    line_at,
+    lines_of,
+    number_of,
+    why_too_few,
+    why_too_many,
+)
+from drivers.stations.tables.columns import CARTESIAN, POLAR
+from drivers.stations.tables.guess import CLOCK_FORMATS, guess_table
+from drivers.stations.tables.named_units import mm_of
 
 _FEW_STATIONS = 2  # so few different values always count as set-ups, even with one row each
 _OWN_VALUES = 0.8  # a column with more different values than this share of the rows does not name set-ups

@@ -1,0 +1,1 @@
+"""Tables of measured points, as instruments and people export them: cells, columns, units, and guesses of them."""
