@@ -1,4 +1,4 @@
-"""Faults of data or rig file: every single mistake that the ranges of the data do not exclude, as a hypothesis."""
+"""Hypotheses of single mistakes in data or rig file, except those that the ranges of the data exclude."""
 
 from __future__ import annotations
 
@@ -16,27 +16,27 @@ from calibration.rig.description import Joint, Rig
 
 _LENGTHS = {"m": 1000.0, "cm": 10.0, "micrometres": 1e-3, "inches": 25.4, "feet": 304.8}
 _ANGLES = {"radians": math.degrees(1.0), "gon": 0.9}
-_SPAN = 1.3  # times the span of the limits that readings in another unit may fill
-_SIZE = 4.0  # how far, as a factor, positions may be from the size that the nominal rig has
-_MOST_RADIANS = 4.0 * math.pi  # of a joint that reads on any turn; one that turns often says so by its limits
+_SPAN = 1.3  # times the span of the limits, within which readings converted from another unit may lie
+_SIZE = 4.0  # greatest ratio, either way, of the extent of the positions to that of the nominal rig's
+_MOST_RADIANS = 4.0 * math.pi  # of any joint; larger readings must also lie about the joint's limits
 
 
 @dataclass(frozen=True, eq=False)
 class Fault:
-    """A mistake in the data or the rig file, as a change of the data that makes it good.
+    """A mistake in the data or the rig file, with the change of the data that corrects it.
 
     Attributes:
         what: the mistake, in words.
         remedy: what to do about it.
-        subjects: whatever it concerns; no two faults are supposed of one subject, save that a reversed joint may be
-            turned as well.
-        column: column that a joint is read from instead, by joint.
-        factor: of the readings, by joint.
-        turn_deg: added to them, by joint.
-        prism: prism that a label means instead, by label.
-        rows_up: by how many rows the readings of all joints are moved up, beside the fixes.
-        size: factor of the positions.
-        mirrored: True if they are also mirrored.
+        subjects: the columns, prisms or properties that it concerns. Two faults of one hypothesis never share a
+            subject, except that a reversed joint may be turned as well.
+        column: joint whose column holds the readings of a joint, by joint.
+        factor: factor to apply to the readings, by joint.
+        turn_deg: angle to add to the readings, by joint.
+        prism: prism that a label really means, by label.
+        rows_up: number of rows to move the readings of all joints up, relative to the fixes.
+        size: factor to apply to the positions.
+        mirrored: whether to mirror the positions as well.
     """
 
     what: str
@@ -52,16 +52,16 @@ class Fault:
 
     @property
     def is_turn(self) -> bool:
-        """True where a parameter of the model can make it good as well."""
+        """True if the fault turns joints, which parameters of the model can correct as well."""
         return bool(self.turn_deg)
 
     @property
     def is_reversal(self) -> bool:
-        """True where joints run the other way round."""
+        """True if the fault reverses joints."""
         return any(factor < 0.0 for factor in self.factor.values())
 
     def corrected(self, samples: Samples) -> Samples:
-        """Samples, all of them and in the order of their rows, as they would be without the mistake."""
+        """Return the samples without the mistake; `samples` must be complete and in the order of their rows."""
         data = samples.data
         readings = data.readings.copy()
         for joint, column in self.column.items():
@@ -79,7 +79,7 @@ class Fault:
 
 
 def possible_faults(chain: Chain, samples: Samples) -> Iterator[Fault]:
-    """Every fault that the ranges of the data do not exclude."""
+    """Yield every fault that the ranges of the data do not exclude."""
     rig, readings = chain.rig, samples.data.readings
     units = list(_units(rig, readings))
     yield from _signs_and_turns(rig)
@@ -88,7 +88,7 @@ def possible_faults(chain: Chain, samples: Samples) -> Iterator[Fault]:
     yield from _exchanges(rig, sorted(set(samples.data.prism.tolist())))
     yield Fault(
         "the coordinates are mirrored",
-        "x = east, y = north, z = up is right-handed: swap the two axes that are exchanged, or turn one round",
+        "x = east, y = north, z = up is right-handed: swap the two axes that are exchanged, or reverse one",
         frozenset({"handedness"}),
         mirrored=True,
     )
@@ -99,15 +99,15 @@ def possible_faults(chain: Chain, samples: Samples) -> Iterator[Fault]:
             frozenset({"order of rows"}),
             rows_up=rows_up,
         )
-    # Who writes positions in m writes readings in SI units as well, and neither alone would show.
+    # Positions in m often come with readings in SI units, and correcting only one of them shows no improvement.
     for before in (None, *(unit for unit in units if len(unit.subjects) > 1)):
         yield from _sizes(chain, samples, before)
 
 
 def _sizes(chain: Chain, samples: Samples, before: Fault | None) -> Iterator[Fault]:
-    """Positions in another unit, together with a fault of the readings."""
+    """Yield faults of positions in another unit, together with a fault `before` of the readings if there is one."""
     samples = before.corrected(samples) if before else samples
-    # The nominal rig tells the size of the work volume, wherever it stands.
+    # The nominal rig gives the extent of the work volume, independent of where the rig stands.
     expected_mm = spread_mm(chain.positions_mm(np.zeros(len(chain)), samples.data), samples.data.setup)
     measured_mm = spread_mm(samples.position_mm, samples.data.setup)
     for unit, factor in _LENGTHS.items():
@@ -153,7 +153,7 @@ def _signs_and_turns(rig: Rig) -> Iterator[Fault]:
 
 
 def _ratios(rig: Rig) -> Iterator[Fault]:
-    """A unit that the rig file converts though the column is converted already, or a gear that is not there."""
+    """Yield faults of a unit that the rig file converts a second time, or of a gear that does not exist."""
     for i, joint in enumerate(rig.joints):
         ratio = max(abs(coefficient) for _, _, name, coefficient in rig.couplings() if name == joint.name)
         if ratio != 1.0:
@@ -207,7 +207,7 @@ def _exchanges(rig: Rig, seen: Sequence[int]) -> Iterator[Fault]:
 
 
 def _may_be(joint: Joint, values: Floats, unit: str) -> bool:
-    """True if readings of an angle may be in a unit."""
+    """Return True if the readings of a joint may be angles in a unit."""
     if joint.kind != "revolute":
         return False
     few = unit != "radians" or float(np.abs(values).max()) <= _MOST_RADIANS
@@ -215,7 +215,7 @@ def _may_be(joint: Joint, values: Floats, unit: str) -> bool:
 
 
 def _fits(joint: Joint, values: Floats, factor: float) -> bool:
-    """True if values in another unit lie about the joint's limits."""
+    """Return True if the values, multiplied by the factor of their unit, lie about within the joint's limits."""
     low, high = joint.limits
     margin = (_SPAN - 1.0) * (high - low)
     return bool(factor * values.min() > low - margin and factor * values.max() < high + margin)

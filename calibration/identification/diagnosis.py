@@ -1,10 +1,10 @@
-"""Diagnosis of data that the rig file reads wrongly: which faults make them fit, and what to call them.
+"""Diagnosis of data that the rig file reads wrongly: find the faults whose correction makes them fit.
 
-A reversed sign, another unit, exchanged columns or an encoder mounted turned is a basin of its own that no search
-within build tolerances reaches; where a search does reach one, it is a wrong model that looks right on a part of the
-work volume. So each fault is supposed in turn: the readings are changed as it says, the base is placed anew and
-the parameters are brought near their optimum. Two or three faults at once may show no gain before all are right;
-the few best hypotheses are therefore carried on (beam search).
+A reversed sign, a wrong unit, exchanged columns or an encoder that is mounted turned creates a basin of attraction of
+its own, which no search within build tolerances reaches. Where a search does reach one, the result is a wrong model
+that looks right on a part of the work volume. So every fault is tried: the readings are corrected for it, the base is
+placed again and the parameters are brought near their optimum. Two or three simultaneous faults may show no
+improvement until all are corrected; therefore the few best hypotheses are kept and extended (beam search).
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ from calibration.rig.description import Rig
 from calibration.rig.limits import beyond_limits, on_one_turn
 
 _ROWS = 120
-_TRIMMED = 0.75
+_TRIMMED = 0.75  # share of each prism's errors that count
 _APPROACHING = 40  # rounds
-_PLACING = 20  # rounds; a rough place tells hypotheses apart
-_CARRIED = 6
+_PLACING = 20  # rounds; a rough placement is enough to rank hypotheses
+_CARRIED = 6  # hypotheses to extend
 _TOGETHER = 32  # hypotheses whose positions are computed at once
 _APPROACHED = 10  # of the best roughly placed hypotheses of a round
-_MUCH = 0.5  # of the misfit before; a further fault that gains less says nothing
-_EXPLAINS = 0.25  # of the misfit as given, or less: an explanation
-_SETTLES = 0.1  # likewise, and no more than needs no explanation: nothing further need be supposed
-_SLACK = 0.05  # of a joint's range: its limits are no more exact
-_ALIKE = 1.5  # times the least misfit: as good an explanation
+_MUCH = 0.5  # of the misfit before; a fault that leaves more is no evidence
+_EXPLAINS = 0.25  # of the misfit of the given data; faults that leave less explain it
+_SETTLES = 0.1  # of the same; if it is also tolerable, no further faults are tried
+_SLACK = 0.05  # of a joint's range; its limits are not known more exactly
+_ALIKE = 1.5  # times the least misfit; below it, explanations count as equally good
 
 Hypothesis = tuple[Fault, ...]
 
@@ -46,9 +46,9 @@ class Quality:
     """Quality of a model's fit to data.
 
     Attributes:
-        misfit_mm: mean of the smaller three quarters of every prism's 3-D errors: outliers do not count, a wrong prism
-            does.
-        pull: RMS of the corrections in build tolerances.
+        misfit_mm: mean of the smaller three quarters of every prism's 3-D errors, so that outliers do not count but a
+            wrong prism does.
+        pull: RMS of the corrections, in build tolerances.
     """
 
     misfit_mm: float
@@ -56,7 +56,7 @@ class Quality:
 
     @classmethod
     def of(cls, chain: Chain, samples: Samples, x: Floats, misfit_mm: Floats | None = None) -> Quality:
-        """Quality of a chain with parameters `x` (p,), whose 3-D misfits (m,) may be known."""
+        """Quality of a chain with parameters `x` (p,); 3-D misfits (m,) are computed if not given."""
         if misfit_mm is None:
             misfit_mm = np.linalg.norm(samples.position_mm - chain.positions_mm(x, samples.data), axis=1)
         of_prisms = (np.sort(misfit_mm[samples.data.prism == prism]) for prism in np.unique(samples.data.prism))
@@ -66,12 +66,12 @@ class Quality:
         return cls(float(used.mean()), math.sqrt(float(pull @ pull) / max(1, len(pull))))
 
     def much_better_than(self, other: Quality) -> bool:
-        """True for a much smaller misfit, or one as small with much smaller corrections."""
+        """Return True for a much smaller misfit, or a similar one with much smaller corrections."""
         alike = self.misfit_mm < _ALIKE * other.misfit_mm
         return self.misfit_mm < _MUCH * other.misfit_mm or (alike and self.pull < _MUCH * other.pull)
 
     def explains(self, before: Quality, tolerated_mm: float) -> bool:
-        """True if little is left of the misfit, or of the corrections where the misfit was tolerable already."""
+        """Return True if the misfit became much smaller or, where it was tolerable before, the corrections did."""
         if before.misfit_mm < tolerated_mm:
             return self.pull < _MUCH * before.pull
         return self.misfit_mm < _EXPLAINS * before.misfit_mm
@@ -84,11 +84,10 @@ class Diagnosis:
     Attributes:
         faults: all of them together.
         others: sets of faults that explain the data about as well.
-        chain: with the bases placed on the data so changed.
-        x: (p,) parameters near the optimum there, for the data as they are; None where no parameters can stand for
-            the faults.
+        chain: kinematics with the bases placed on the corrected data.
+        x: (p,) parameters for the data as given, near the optimum; None if no parameters can represent the faults.
         before: fit to the data as given.
-        after: fit to the data so changed.
+        after: fit to the corrected data.
     """
 
     faults: Hypothesis
@@ -104,19 +103,19 @@ class Diagnosis:
         return _in_words(self.faults)
 
     def __str__(self) -> str:
-        doubt = "".join(f"; or {_in_words(other)}, which fits as well" for other in self.others)
+        doubt = "".join(f"; or {_in_words(other)}, which fits equally well" for other in self.others)
         remedies = ", and ".join(fault.remedy for fault in self.faults)
         gain = f"{_size(self.after.misfit_mm)} mm are left in place of {_size(self.before.misfit_mm)} mm"
         if self.after.misfit_mm > _MUCH * self.before.misfit_mm:
             gain = (
                 f"the corrections are {_size(self.after.pull)} build tolerances in place of {_size(self.before.pull)}"
             )
-        return f"{self.what}: taken so, {gain}{doubt}; {remedies}"
+        return f"{self.what}: with that corrected, {gain}{doubt}; {remedies}"
 
 
 @dataclass(frozen=True)
 class _Candidate:
-    """A hypothesis with the fit to the data so changed."""
+    """A hypothesis with the fit to the data corrected for it."""
 
     faults: Hypothesis
     placements: Mapping[str, Placement]
@@ -133,18 +132,21 @@ def diagnose(
     tolerated_mm: float,
     at_once: int,
 ) -> Diagnosis | None:
-    """Look for faults that explain why data do not fit, or fit with a model far from the rig file only.
+    """Find faults that explain why data do not fit, or fit only with a model far from the rig file.
 
     Args:
         chain: kinematics.
-        samples: the rows in question.
-        precision: (p,) 1 / sigma^2 of the prior that the parameters are held by.
-        before: the best fit to them as they are given.
+        samples: the rows.
+        precision: (p,) 1 / sigma^2 of the parameters' prior.
+        before: the best fit to the samples as given.
         tolerated_mm: misfit that needs no explanation.
-        at_once: number of faults to suppose together at most.
+        at_once: greatest number of simultaneous faults.
+
+    Returns:
+        The diagnosis, or None if no faults explain the data.
     """
     blank = Chain(chain.rig, {setup: Placement.identity() for setup in chain.setups})
-    # A part of the samples is enough to tell hypotheses apart.
+    # A part of the samples is enough to rank hypotheses.
     part = draw_rows(samples.data, samples.position_mm, _ROWS, 0)
     possible = list(possible_faults(blank, samples))
     carried: list[Hypothesis] = [()]
@@ -170,7 +172,7 @@ def diagnose(
         carried = list(dict.fromkeys(c.faults for c in (*near[: _CARRIED // 2], *rough)))[:_CARRIED]
     if not best or not least.explains(before, tolerated_mm):
         return None
-    # As few faults as may be; what keeps to the limits of the joints is said first.
+    # Only the smallest sets of faults; the set with the fewest readings beyond joint limits first.
     fewest = min(len(candidate.faults) for candidate in best)
     best = [candidate for candidate in best if len(candidate.faults) == fewest]
     best.sort(key=lambda candidate: _readings_beyond_limits(chain.rig, _corrected(samples, candidate.faults)))
@@ -180,7 +182,7 @@ def diagnose(
 
 
 def _extended(carried: Sequence[Hypothesis], possible: Sequence[Fault]) -> list[Hypothesis]:
-    """Every hypothesis with one more fault, each set of faults once."""
+    """Return every hypothesis extended by one fault, each set of faults once."""
     seen: dict[frozenset[str], Hypothesis] = {}
     for before in carried:
         for more in possible:
@@ -191,7 +193,7 @@ def _extended(carried: Sequence[Hypothesis], possible: Sequence[Fault]) -> list[
 
 
 def _reversed_pairs(possible: Sequence[Fault]) -> list[Hypothesis]:
-    """Two joints the other way round: either alone may be worse than none, as lengths that turn two axes about are."""
+    """Return pairs of reversed joints: correcting one alone may worsen the fit, as with lengths that turn two axes."""
     reversals = [fault for fault in possible if fault.is_reversal]
     return [pair for pair in itertools.combinations(reversals, 2) if _compatible(pair[:1], pair[1])]
 
@@ -211,7 +213,7 @@ def _corrected(samples: Samples, faults: Hypothesis) -> Samples:
 
 
 def _placed(blank: Chain, samples: Samples, part: Integers, hypotheses: Sequence[Hypothesis]) -> list[_Candidate]:
-    """Place the nominal rig on a part of the data, changed by each hypothesis; drop those where it cannot be placed."""
+    """Place the nominal rig on a part of the data, corrected for each hypothesis; drop those where that fails."""
     changed = [_corrected(samples, faults).select(part) for faults in hypotheses]
     at_once = ChainData(
         np.concatenate([own.data.readings for own in changed]),
@@ -224,7 +226,7 @@ def _placed(blank: Chain, samples: Samples, part: Integers, hypotheses: Sequence
     for faults, own, own_mm in zip(hypotheses, changed, in_base_mm, strict=True):
         try:
             start = rough_start(blank, own, nominal, mirrored="let pass", rounds=_PLACING, in_base_mm=own_mm)
-        except UnsafeError:  # positions that so changed lie on a line
+        except UnsafeError:  # the corrected positions lie on a line
             continue
         quality = Quality.of(blank, own, start.x, start.misfit_mm)
         out.append(_Candidate(faults, start.placements, start.x, quality))
@@ -244,7 +246,7 @@ def _readings_beyond_limits(rig: Rig, samples: Samples) -> int:
 
 
 def _for_raw_data(chain: Chain, candidate: _Candidate) -> Floats | None:
-    """Turned joints as offsets of the rows that they drive; None for what offsets cannot stand for."""
+    """Return parameters with turned joints as offsets of the rows that they drive; None if any fault is no offset."""
     x = candidate.x.copy()
     for fault in candidate.faults:
         for joint, turn_deg in fault.turn_deg.items():

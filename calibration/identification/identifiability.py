@@ -1,8 +1,8 @@
 """Identifiability by the singular values of the whitened Jacobian, each parameter measured in prior sigmas.
 
-The prior itself takes no part: a direction counts as seen where the data alone would determine it within ten prior
-sigmas. Everything else stays at its prior and is named in words: parameters that no fix depends on with the reason
-where it can be known, redundant ones with what they repeat.
+The prior itself adds no information: a direction counts as seen if the data alone determine it within ten prior
+sigmas. All others stay at their prior and are described in words: parameters that no fix depends on with the reason
+if it is known, redundant ones with the parameters that they repeat.
 """
 
 from __future__ import annotations
@@ -20,23 +20,23 @@ from calibration.kinematics.chain import Chain, Linearisation
 from calibration.numerics.statistics import halton
 from calibration.observations import Floats
 
-_SEEN = 0.1
+_SEEN = 0.1  # least singular value of a direction that the data see
 _FLAT_SIGMA = {"mm": 1e3, "rad": 1.0}
-_ALIKE = 0.9  # parameters that stay at their prior as much as the one that stays most are equal candidates
+_ALIKE = 0.9  # parameters that stay at their prior nearly as much as the one that stays most are equal candidates
 _MARKED = 0.1  # share of a parameter's prior variance that the data leave
 _PART = 0.05  # smallest share of a combination that is worth naming
-_NAMED = 4
+_NAMED = 4  # parameters named one by one
 
 
 @dataclass(frozen=True)
 class Identifiability:
-    """Number and names of the parameters that the data determine or do not.
+    """Number of parameters that the data determine, and names of those that they do not.
 
     Attributes:
-        parameters: how many were asked for: of the kinematics, and the coefficients of effects fitted along.
-        rank: how many directions of them the data see.
-        unidentifiable: one sentence for each direction they do not see.
-        marked: names of the parameters that stay at their prior, by a tenth of their prior variance or more.
+        parameters: number of parameters analysed, including coefficients of effects in the same fit.
+        rank: number of directions in their space that the data see.
+        unidentifiable: one sentence for each direction that the data do not see.
+        marked: names of the parameters of whose prior variance a tenth or more remains.
         observability: `O1` .. `O5`, larger is better (`observability_indices`); empty if the data see nothing.
     """
 
@@ -56,9 +56,9 @@ class _Asked:
     """The parameters under analysis."""
 
     names: tuple[str, ...]
-    words: tuple[tuple[str, str], ...]  # each as the one meant, and as one of several that are named together
+    words: tuple[tuple[str, str], ...]  # each as the subject, and as one of several that are named together
     sigma: Floats  # of the prior
-    columns: NDArray[np.intp]  # among parameters and coefficients
+    columns: NDArray[np.intp]  # indices among parameters and coefficients
 
 
 def identifiability(
@@ -71,23 +71,25 @@ def identifiability(
     additions: EffectColumns | None = None,
     listed: NDArray[np.bool_] | None = None,
 ) -> Identifiability:
-    """Find rank and null space of the parameters, and name them.
+    """Find the rank of the parameters and describe their null space in words.
 
     Args:
         chain: kinematics.
         samples: m rows.
-        x: (p,) parameters at which to look, (p + k,) where coefficients are not zero.
-        excess_variance: what the scatter of the data adds to their covariance, mm^2 per axis.
-        free: (p,) which parameters are asked for, the others being known (base and prisms, say); all by default.
-        additions: k coefficients of effects that are fitted along.
-        listed: (k,) which of them are asked for, all by default; the others only shape a curve and count as known.
+        x: (p,) parameters at which to linearise, (p + k,) if coefficients are not zero.
+        excess_variance: variance that the scatter of the data adds to their covariance, mm^2 per axis.
+        free: (p,) mask of the parameters to analyse, all by default. The others count as known (base and prisms, for
+            example).
+        additions: k coefficients of effects in the same fit.
+        listed: (k,) mask of the coefficients to analyse, all by default. The others only shape a curve and count as
+            known.
     """
     coefficients = 0 if additions is None else len(additions)
     at = np.concatenate([x, np.zeros(len(chain) + coefficients - len(x))])
     asked = _asked(chain, free, additions, np.ones(coefficients, dtype=bool) if listed is None else listed)
     whitened = _whitened(chain, samples, at, excess_variance, additions, asked)
     count, effect = len(asked.names), np.linalg.norm(whitened, axis=0)
-    # The triangle has the singular values of the whole, at a fraction of the cost.
+    # R of the QR decomposition has the same singular values, at a fraction of the cost.
     _, singular, vt = np.linalg.svd(np.linalg.qr(whitened, mode="r"), full_matrices=True)
     rank = int((singular > _SEEN).sum())
     null = vt[rank:]
@@ -100,7 +102,7 @@ def identifiability(
         blind, combinations = _echelon(null, effect)
         for i in blind:
             reason = _why_blind(chain, samples, asked.names[i]) or _why(chain, moved, np.eye(count)[i])
-            sentences.append(f"{asked.names[i]}: the data say nothing of {asked.words[i][0]}{reason}")
+            sentences.append(f"{asked.names[i]}: the data show nothing about {asked.words[i][0]}{reason}")
         for pivot, direction in combinations:
             sentences.append(_repeats(asked, pivot, direction * effect) + _why(chain, moved, direction))
     left = (null**2).sum(axis=0)
@@ -114,10 +116,10 @@ def identifiability(
 
 
 def observability_indices(singular: Floats, measurements: int) -> dict[str, float]:
-    """The five observability indices of a set of measurements.
+    """Return the five observability indices of a set of measurements.
 
     With the singular values s_1 >= ... >= s_r of the identification Jacobian, here whitened by the covariance of the
-    fixes and in prior sigmas of each parameter, so that all are without unit:
+    fixes and in prior sigmas of each parameter, so that all are dimensionless:
 
         O1 = (s_1 s_2 ... s_r)^(1/r) / sqrt(m)   Borm and Menq (1991): volume of the confidence ellipsoid (D-optimal)
         O2 = s_r / s_1                           Driels and Pathre (1990): its eccentricity (condition number)
@@ -126,7 +128,7 @@ def observability_indices(singular: Floats, measurements: int) -> dict[str, floa
         O5 = 1 / (1/s_1 + ... + 1/s_r)           Sun and Hollerbach (2008): sum of its axes (near A-optimal)
 
     Args:
-        singular: (r,) positive, falling, of the directions that the data see.
+        singular: (r,) positive singular values, in descending order, of the directions that the data see.
         measurements: m, number of fixes.
 
     Returns:
@@ -170,7 +172,7 @@ def _asked(
 def _whitened(
     chain: Chain, samples: Samples, at: Floats, excess_variance: float, additions: EffectColumns | None, asked: _Asked
 ) -> Floats:
-    """(3 m, q) change of the fixes in their sigmas by one prior sigma of each parameter asked for."""
+    """Return the (3 m, q) change of the fixes, in their sigmas, by one prior sigma of each parameter analysed."""
     lin = _linearised(chain, samples, at, additions)
     covariance = samples.covariance(chain.rig, lin.joint_jacobian) + excess_variance * np.eye(3)
     whitened = np.linalg.solve(np.linalg.cholesky(covariance), lin.jacobian[:, :, asked.columns] * asked.sigma)
@@ -178,7 +180,7 @@ def _whitened(
 
 
 def _linearised(chain: Chain, samples: Samples, at: Floats, additions: EffectColumns | None) -> Linearisation:
-    """Linearise the m samples by p parameters and k coefficients, values `at` (p + k,)."""
+    """Linearise the m samples with respect to p parameters and k coefficients, at the values `at` (p + k,)."""
     if additions is None:
         return chain.linearise(at, samples.data)
     p = len(chain)
@@ -189,15 +191,15 @@ def _linearised(chain: Chain, samples: Samples, at: Floats, additions: EffectCol
 
 
 def _echelon(null: Floats, effect: Floats) -> tuple[list[int], list[tuple[int, Floats]]]:
-    """Bring the null space (k, q), in prior sigmas, to reduced echelon form: a row is one parameter and its repeats.
+    """Bring the null space (k, q), in prior sigmas, to reduced echelon form: one parameter and its repeats per row.
 
-    The pivots are the parameters that stay at their prior most; of equal ones the last, as earlier rows are what people
-    look for.
+    The pivots are the parameters that stay at their prior most. Of equal ones the last is used, as people look for
+    the earlier ones.
 
     Returns:
-        Columns whose own `effect` (q,) is nothing; (pivot, (q,) direction of length 1) of the others.
+        Columns whose own `effect` (q,) is negligible; pivot and direction (q,), of length 1, of each other row.
     """
-    # So small that all of them together are still not seen: each takes one direction of the null space by itself.
+    # Their effects are so small that even all together are not seen: each is one direction of the null space.
     blind = effect <= _SEEN / math.sqrt(len(effect))
     others = np.flatnonzero(~blind)
     # An orthonormal basis of the strongest directions.
@@ -224,9 +226,9 @@ def _echelon(null: Floats, effect: Floats) -> tuple[list[int], list[tuple[int, F
 
 
 def _repeats(asked: _Asked, pivot: int, part: Floats) -> str:
-    """`row2.beta repeats row3.theta: beta at row 2 repeats the offset of theta3`.
+    """Return a sentence such as `row2.beta repeats row3.theta: beta at row 2 repeats the offset of theta3`.
 
-    `part` (q,) is what each parameter's share of the combination moves: that counts, not the unit it is in.
+    `part` (q,) is the effect on the fixes of each parameter's share of the combination, whatever its unit.
     """
     order = np.argsort(-np.abs(part), kind="stable").tolist()
     others = [i for i in order if i != pivot and abs(part[i]) > _PART * abs(part[pivot])]
@@ -242,7 +244,7 @@ def _listed(items: Iterable[str], more: int) -> str:
 
 
 def _words(chain: Chain, name: str) -> tuple[str, str]:
-    """Words for a parameter: as the one meant, and as one of several that are named together."""
+    """Return words for a parameter: as the subject, and as one of several that are named together."""
     where, _, constant = name.rpartition(".")
     if where.startswith("base"):
         setup = where.removeprefix("base")[1:-1]
@@ -263,7 +265,7 @@ def _words(chain: Chain, name: str) -> tuple[str, str]:
 
 
 def _words_of_coefficient(name: str) -> tuple[str, str]:
-    """Words for a coefficient, as `_words`."""
+    """Return words for a coefficient, in the form of `_words`."""
     family, _, place = name.partition("@")
     where, _, coefficient = place.partition(":")
     text = f"{coefficient} of {family} at {where}" if coefficient else f"{family} at {where}"
@@ -271,7 +273,7 @@ def _words_of_coefficient(name: str) -> tuple[str, str]:
 
 
 def _why_blind(chain: Chain, samples: Samples, name: str) -> str:
-    """Reason why no fix depends on a parameter: no prism beyond it, or no fix at its set-up, was measured."""
+    """Return the reason why no fix depends on a parameter: no prism beyond it or nothing at its set-up was measured."""
     where, _, _ = name.rpartition(".")
     measured = [chain.rig.prisms[i] for i in np.unique(samples.data.prism)]
     if where.startswith("prism.") and where.removeprefix("prism.") not in {p.name for p in measured}:
@@ -284,7 +286,7 @@ def _why_blind(chain: Chain, samples: Samples, name: str) -> str:
 
 
 def _with_still_joints_moved(chain: Chain, samples: Samples) -> dict[tuple[int, ...], Samples]:
-    """Rows as they would be had joints that never moved been moved through their limits: each, and all."""
+    """Return samples in which joints that never moved span their limits: each such joint alone, and all together."""
     readings = samples.data.readings
     still = np.flatnonzero(np.ptp(readings, axis=0) <= standing_spread(chain.rig)).tolist()
     if not still:
@@ -303,7 +305,7 @@ def _with_still_joints_moved(chain: Chain, samples: Samples) -> dict[tuple[int, 
 
 
 def _why(chain: Chain, moved: Mapping[tuple[int, ...], Floats], direction: Floats) -> str:
-    """Reason why a direction (q,) is not seen: joints that never moved and would show it if they did."""
+    """Return the reason why a direction (q,) is not seen: joints that never moved and would show it if they did."""
     for joints, whitened in moved.items():
         if float(np.linalg.norm(whitened @ direction)) > _SEEN:
             names = _listed([chain.rig.joint_names[j] for j in joints], 0)

@@ -1,6 +1,6 @@
-"""The linear model of samples about given parameters: errors, derivatives and noise.
+"""Linearisation of samples about given parameters: errors, derivatives and noise.
 
-Rows are in the order of their standstills, whose fixes share random errors of their readings.
+Rows are sorted by standstill, as the fixes of one standstill share random errors of their readings.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from calibration.observations import Floats
 
 Flags = NDArray[np.bool_]
 
-FLAT_MM = 1e3  # "unknown": wide enough to pull on nothing that is measured, finite so that nothing is singular
+FLAT_MM = 1e3  # of unknown parameters: too wide to affect anything measured, finite so that no matrix is singular
 FLAT_RAD = 1.0
 
 
 def prior_precision(chain: Chain, scale: float) -> Floats:
-    """(p,) 1 / sigma^2 of every parameter's prior."""
+    """Return (p,) 1 / sigma^2 of every parameter's prior, with build tolerances multiplied by `scale`."""
     flat = np.array([FLAT_MM if p.unit == "mm" else FLAT_RAD for p in chain.parameters])
     sigma = np.where(np.isinf(chain.prior_sigma), flat, chain.prior_sigma * scale)
     return 1.0 / sigma**2
@@ -37,8 +37,8 @@ class Linearised:
     Attributes:
         x: parameters and coefficients.
         error: (m, 3) measured minus modelled, mm.
-        jacobian: (m, 3, p + k) by parameters and coefficients.
-        by_joint: (m, 3, joints) by reading.
+        jacobian: (m, 3, p + k) derivatives by parameters and coefficients.
+        by_joint: (m, 3, joints) derivatives by readings.
     """
 
     x: Floats
@@ -48,22 +48,22 @@ class Linearised:
 
 
 class LinearModel:
-    """Function from parameters to the model linearised there.
+    """Model of samples that can be linearised at given parameters.
 
     Args:
         chain: kinematics, p parameters.
         samples: m rows.
-        free: which parameters move; all by default, and all coefficients where it has p entries.
+        free: (p,) or (p + k,) mask of what a fit may change; all by default, and all coefficients if it has p entries.
         additions: k coefficients of effects, with columns for the m rows.
 
     Attributes:
         chain: kinematics.
         order: (m,) sample of each row.
-        free: (p + k,) which parameters and coefficients move.
-        tolerated: (p + k,) which of these have a build tolerance.
+        free: (p + k,) mask of the parameters and coefficients that the fit may change.
+        tolerated: (p + k,) mask of those among them that have a build tolerance.
 
     Raises:
-        ValueError: additions for another number of rows.
+        ValueError: the number of rows of the additions differs from m.
     """
 
     def __init__(
@@ -74,7 +74,7 @@ class LinearModel:
         additions: EffectColumns | None = None,
     ) -> None:
         if additions is not None and len(additions.column) != len(samples):
-            raise ValueError(f"additions have {len(additions.column)} rows where there are {len(samples)} samples")
+            raise ValueError(f"additions have {len(additions.column)} rows for {len(samples)} samples")
         self.order = np.argsort(samples.standstill, kind="stable")
         self._is_in_order = bool((np.diff(self.order) > 0).all())
         following = np.flatnonzero(np.diff(samples.standstill[self.order])) + 1
@@ -94,11 +94,11 @@ class LinearModel:
         self.tolerated = self.free & np.concatenate([np.isfinite(chain.prior_sigma), np.zeros(len(added), dtype=bool)])
 
     def extended(self, x: Floats) -> Floats:
-        """Append the coefficients that `x` lacks, at zero."""
+        """Append zeros to `x` for the coefficients that it lacks."""
         return np.concatenate([x, np.zeros(len(self.free) - len(x))])
 
     def precision(self, scale: float) -> Floats:
-        """Prior precision of all that is free; tolerances of effects are no build tolerances and keep their scale."""
+        """Return the prior precision of all free values; `scale` multiplies build tolerances, not priors of effects."""
         precision: Floats = np.concatenate([prior_precision(self.chain, scale), self._added_precision])[self.free]
         return precision
 
@@ -113,20 +113,31 @@ class LinearModel:
         return Linearised(x, self._position_mm - position, jacobian, by_joint)
 
     def marginals(self, state: Linearised, excess: float) -> Marginals:
-        """Covariance of every row by itself, with the excess variance s^2."""
+        """Return the covariance of every row by itself.
+
+        Args:
+            state: rows linearised at some parameters.
+            excess: excess variance s^2, mm^2 per axis.
+        """
         velocity = (state.by_joint @ self._rates[:, :, None])[:, :, 0]
         return marginals(self._station, velocity, state.by_joint, self._variance, excess, state.error)
 
     def whitening(self, state: Linearised, of_rows: Marginals, weight: Floats) -> Whitening:
-        """Covariance of all rows with weights (m,)."""
+        """Factor the covariance of all rows.
+
+        Args:
+            state: rows linearised at some parameters.
+            of_rows: result of `marginals` there.
+            weight: (m,) probability that a row is no outlier.
+        """
         return factorise(self._start, of_rows, state.by_joint, self._shared, weight)
 
     def by_row(self, values: Floats) -> Floats:
-        """Inverse of `by_sample`."""
+        """Sort values (m, ...) of the samples into the order of the rows; the inverse of `by_sample`."""
         return values if self._is_in_order else values[self.order]
 
     def by_sample(self, values: Floats) -> Floats:
-        """Sort values (m, ...) of the rows into the order of the samples; no copy where it is the same."""
+        """Sort values (m, ...) of the rows into the order of the samples; no copy if both orders are the same."""
         if self._is_in_order:
             return values
         out = np.empty_like(values)
@@ -143,7 +154,7 @@ def information(
     weight: Floats | None = None,
     additions: EffectColumns | None = None,
 ) -> Floats:
-    """Information J' V^-1 J of the samples alone, without a prior, on the parameters (p,) or (p + k,).
+    """Return the information J' V^-1 J of the samples on the parameters, (p, p) or (p + k, p + k), without a prior.
 
     Args:
         chain: kinematics.

@@ -4,11 +4,11 @@ Fixes of one standstill share random errors of its readings, so their covariance
 
     V = blockdiag(S_i) + J_q Sigma_q J_q'
 
-over all of them, S_i being station, timing, excess and errors that the readings of each fix have to themselves. A row
-with the probability w of being no outlier counts as if independent noise of covariance (1/w - 1) V_ii came on top:
-w = 1 is the model above, w = 0 takes the row out, and a standstill of a single fix gets the familiar w V^-1. With W the
-w on the diagonal, V_w = W^-1/2 A W^-1/2, where A has the blocks V_ii on its diagonal and sqrt(w_i w_j) J_i Sigma_q J_j'
-beside it; so nothing is ever divided by w.
+over all of them, where S_i covers station, timing, excess and the errors of readings that each fix has separately. A
+row with the probability w of being no outlier counts as if it had additional independent noise of covariance
+(1/w - 1) V_ii: w = 1 is the model above, w = 0 removes the row, and a standstill of a single fix gets the familiar
+w V^-1. With W the diagonal matrix of the w, V_w = W^-1/2 A W^-1/2, where A has the blocks V_ii on its diagonal and
+sqrt(w_i w_j) J_i Sigma_q J_j' off it; so nothing is ever divided by w.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ from calibration.rig.description import Rig
 
 Integers = NDArray[np.intp]
 
-_ROUNDING = 1e-13  # least pivot over its diagonal
+_ROUNDING = 1e-13  # least pivot, relative to its diagonal element
 
 
 def station_covariance(rig: Rig, position_mm: Floats, sigma_mm: Floats) -> Floats:
-    """(n, 3, 3) covariance of fixes by the instrument's circles, distance and target centring, mm^2.
+    """Return the (n, 3, 3) covariance of fixes due to the instrument's circles, distance and target centring, mm^2.
 
     Args:
-        rig: gives the instrument.
+        rig: describes the instrument.
         position_mm: (n, 3) in the station's frame.
-        sigma_mm: (n, 3) used instead where finite.
+        sigma_mm: (n, 3) standard deviations of x, y, z to use instead where all three are finite.
     """
     station = rig.station
     range_mm = np.maximum(np.linalg.norm(position_mm, axis=1), 1e-6)
@@ -51,25 +51,39 @@ def station_covariance(rig: Rig, position_mm: Floats, sigma_mm: Floats) -> Float
 
 
 def reading_variance(rig: Rig) -> Floats:
-    """(joints,) variance of a reading, deg^2 or mm^2: sigma^2 + resolution^2 / 12."""
+    """Return the (joints,) variance of a reading, deg^2 or mm^2: sigma^2 + resolution^2 / 12."""
     return np.array([joint.sigma**2 + joint.resolution**2 / 12.0 for joint in rig.joints])
 
 
 def reading_covariance(rig: Rig, joint_jacobian: Floats, rates: Floats) -> Floats:
-    """(n, 3, 3) covariance by readings and instant: J_q Sigma_q J_q' + (J_q q_dot)(J_q q_dot)' sigma_t^2, mm^2."""
+    """Return the (n, 3, 3) covariance due to readings and timing, mm^2.
+
+    It is J_q Sigma_q J_q' + (J_q q_dot)(J_q q_dot)' sigma_t^2.
+
+    Args:
+        rig: gives the random errors of readings and timing.
+        joint_jacobian: (n, 3, joints) J_q, mm per deg or mm.
+        rates: (n, joints) q_dot, deg/s or mm/s.
+    """
     readings = covariance_by_joints(joint_jacobian, reading_variance(rig))
     return readings + timing_covariance(rig, joint_jacobian, rates)
 
 
 def timing_covariance(rig: Rig, joint_jacobian: Floats, rates: Floats) -> Floats:
-    """(n, 3, 3) covariance by the uncertain instant of the fix, mm^2; `rates` (n, joints) in deg/s or mm/s."""
+    """Return the (n, 3, 3) covariance due to the timing of the fix, mm^2.
+
+    Args:
+        rig: gives the random error of timing.
+        joint_jacobian: (n, 3, joints) mm per deg or mm.
+        rates: (n, joints) deg/s or mm/s.
+    """
     velocity = joint_jacobian @ rates[:, :, None] * rig.station.timing_sigma_s
     covariance: Floats = velocity @ velocity.transpose(0, 2, 1)
     return covariance
 
 
 def covariance_by_joints(joint_jacobian: Floats, variance: Floats) -> Floats:
-    """(n, 3, 3) covariance J_q V J_q' of positions by independent errors of the joints' values, mm^2.
+    """Return the (n, 3, 3) covariance J_q V J_q' of positions due to independent errors of the joints, mm^2.
 
     Args:
         joint_jacobian: (n, 3, joints) J_q, mm per deg or mm.
@@ -81,7 +95,7 @@ def covariance_by_joints(joint_jacobian: Floats, variance: Floats) -> Floats:
 
 
 def joint_rates(rig: Rig, observations: Observations) -> Floats:
-    """(n, joints) `<name>_rate` columns; 0 where not measured."""
+    """Return the (n, joints) columns `<name>_rate`, deg/s or mm/s; 0 where not measured."""
     missing = np.zeros(len(observations))
     columns = [observations.extra.get(f"{name}_rate", missing) for name in rig.joint_names]
     rates: Floats = np.nan_to_num(np.column_stack(columns))
@@ -90,7 +104,7 @@ def joint_rates(rig: Rig, observations: Observations) -> Floats:
 
 @compiled
 def _blocks(station: Floats, velocity: Floats, by_joint: Floats, variance: Floats, excess: float, out: Floats) -> None:
-    """V_ii (m, 3, 3): station + timing + readings + excess."""
+    """Write V_ii (m, 3, 3) = station + timing + readings + excess to `out`."""
     for m in range(len(station)):
         for i in range(3):
             for j in range(i + 1):
@@ -104,7 +118,7 @@ def _blocks(station: Floats, velocity: Floats, by_joint: Floats, variance: Float
 
 @compiled
 def _marginals(block: Floats, error: Floats, square: Floats, log_det: Floats, trace: Floats) -> None:
-    """Compute e' V^-1 e, log det V, and traces (m, 2) of V^-1 and V^-2 of every row by itself."""
+    """Compute e' V^-1 e, log det V, and the traces (m, 2) of V^-1 and V^-2, of every row by itself."""
     inverse = np.empty((3, 3))
     for m in range(len(block)):
         v = block[m]
@@ -123,7 +137,7 @@ def _marginals(block: Floats, error: Floats, square: Floats, log_det: Floats, tr
 
 @compiled
 def _assemble(block: Floats, by_joint: Floats, sigma: Floats, root: Floats, shared: Floats, out: Floats) -> None:
-    """A of one standstill's fixes, lower triangle; `shared` is scratch space of as many rows."""
+    """Write the lower triangle of A of one standstill to `out`; `shared` is scratch space with as many rows."""
     for r in range(len(out)):
         fix, c = r // 3, r % 3
         for k in range(len(sigma)):
@@ -139,7 +153,7 @@ def _assemble(block: Floats, by_joint: Floats, sigma: Floats, root: Floats, shar
 
 @compiled
 def _cholesky(matrix: Floats) -> float:
-    """Replace the lower triangle of a matrix by its Cholesky factor; log det."""
+    """Replace the lower triangle of a matrix by its Cholesky factor; return log det."""
     log_det = 0.0
     for r in range(len(matrix)):
         diagonal = matrix[r, r]
@@ -157,7 +171,7 @@ def _cholesky(matrix: Floats) -> float:
 
 @compiled
 def _traces(factor: Floats, inverse: Floats) -> tuple[float, float]:
-    """Traces of A^-1 and A^-2 for a Cholesky factor of A; `inverse` is scratch space."""
+    """Return the traces of A^-1 and A^-2 from a Cholesky factor of A; `inverse` is scratch space."""
     once, twice = 0.0, 0.0
     for q in range(len(factor)):
         for r in range(q, len(factor)):
@@ -181,8 +195,9 @@ def _factorise(
 ) -> None:
     """Factor A by Cholesky, standstill by standstill.
 
-    Row 3 i + c of `factor` (3 m, widest) is the factor's row of coordinate c of fix i; `sigma` (joints,) is what
-    readings share, `root` (m,) is sqrt(w); `sums` (3,) gets log det A and the traces of A^-1 and A^-2.
+    Row 3 i + c of `factor` (3 m, widest) is the factor's row of coordinate c of fix i. `sigma` (joints,) is the shared
+    standard deviation of the readings, `root` (m,) is sqrt(w). `sums` (3,) receives log det A and the traces of A^-1
+    and A^-2.
     """
     widest = factor.shape[1]
     shared, inverse = np.empty((widest, len(sigma))), np.empty((widest, widest))
@@ -199,7 +214,7 @@ def _factorise(
 
 @compiled
 def _whiten(start: Integers, factor: Floats, root: Floats, values: Floats, out: Floats) -> None:
-    """L^-1 W^1/2 times `values` (3 m, p); it may be `out` itself."""
+    """Write L^-1 W^1/2 times `values` (3 m, p) to `out`, which may be `values` itself."""
     for g in range(len(start) - 1):
         first = 3 * start[g]
         for r in range(3 * (start[g + 1] - start[g])):
@@ -216,7 +231,7 @@ def _whiten(start: Integers, factor: Floats, root: Floats, values: Floats, out: 
 
 @compiled
 def _finish(start: Integers, factor: Floats, values: Floats, out: Floats) -> None:
-    """L^-T times `values` (3 m, p): whitened rows become rows of A^-1 W^1/2."""
+    """Write L^-T times `values` (3 m, p) to `out`: this turns whitened rows into rows of A^-1 W^1/2."""
     for g in range(len(start) - 1):
         first, size = 3 * start[g], 3 * (start[g + 1] - start[g])
         for back in range(size):
@@ -234,12 +249,12 @@ def _finish(start: Integers, factor: Floats, values: Floats, out: Floats) -> Non
 
 @dataclass(frozen=True)
 class Marginals:
-    """Every row by itself.
+    """Covariance and error of every row by itself.
 
     Attributes:
         block: (m, 3, 3) covariance V_ii.
         square: (m,) squared Mahalanobis length of the error.
-        log_det: (m,) of V_ii.
+        log_det: (m,) log determinant of V_ii.
         trace: (m, 2) traces of V_ii^-1 and V_ii^-2.
     """
 
@@ -251,14 +266,14 @@ class Marginals:
 
 @dataclass(frozen=True)
 class Whitening:
-    """Factors of the covariance of all rows, outliers weighted down.
+    """Factors of the covariance of all rows, with outliers downweighted.
 
     Attributes:
-        start: (groups + 1,) where the rows of each standstill begin.
+        start: (groups + 1,) first row of each standstill, and the number of rows.
         root: (m,) square root of every row's weight.
         factor: Cholesky factors of A.
-        log_det: of A.
-        trace: d log det V_w / d s^2 and the scale of its square, as the restricted likelihood needs them.
+        log_det: log determinant of A.
+        trace: d log det V_w / d s^2, and the trace that scales the restricted likelihood's curvature.
     """
 
     start: Integers
@@ -268,14 +283,14 @@ class Whitening:
     trace: tuple[float, float]
 
     def whiten(self, values: Floats) -> Floats:
-        """Whiten rows (m, 3, p) or (m, 3): (3 m, p) whose product is J' V_w^-1 J."""
+        """Whiten rows J (m, 3, p) or (m, 3): return R (3 m, p) with R' R = J' V_w^-1 J."""
         stacked = np.ascontiguousarray(values, dtype=np.float64).reshape(3 * len(self.root), -1)
         out = np.empty_like(stacked)
         _whiten(self.start, self.factor, self.root, stacked, out)
         return out
 
     def finish(self, whitened: Floats) -> Floats:
-        """Turn whitened rows into (3 m, p) whose product is J' V_w^-1 (d V_w / d s^2) V_w^-1 J."""
+        """Turn whitened rows into R (3 m, p) with R' R = J' V_w^-1 (d V_w / d s^2) V_w^-1 J."""
         out = np.empty_like(whitened)
         _finish(self.start, self.factor, whitened, out)
         return out
@@ -284,15 +299,15 @@ class Whitening:
 def marginals(
     station: Floats, velocity: Floats, by_joint: Floats, variance: Floats, excess: float, error: Floats
 ) -> Marginals:
-    """Covariances of m rows, each by itself.
+    """Compute the covariances of m rows, each by itself.
 
     Args:
-        station: (m, 3, 3) covariance of the fix, mm^2.
-        velocity: (m, 3) mm that the prism moves within the timing uncertainty.
+        station: (m, 3, 3) covariance of the fixes due to the station, mm^2.
+        velocity: (m, 3) motion of the prism within one sigma of timing, mm.
         by_joint: (m, 3, joints) derivatives by the readings.
-        variance: (m, joints) of the readings.
+        variance: (m, joints) variance of the readings, deg^2 or mm^2.
         excess: s^2, mm^2.
-        error: (m, 3) mm.
+        error: (m, 3) measured minus modelled, mm.
     """
     m = len(error)
     out = Marginals(np.empty((m, 3, 3)), np.empty(m), np.empty(m), np.empty((m, 2)))
@@ -302,9 +317,14 @@ def marginals(
 
 
 def factorise(start: Integers, of_rows: Marginals, by_joint: Floats, shared: Floats, weight: Floats) -> Whitening:
-    """Factors of the covariance of m rows in the order of their standstills, whose first rows `start` has.
+    """Factor the covariance of m rows that are sorted by standstill.
 
-    `shared` (joints,) is the variance of the readings that the fixes of a standstill have in common.
+    Args:
+        start: (groups + 1,) first row of each standstill, and m.
+        of_rows: the rows' own covariances.
+        by_joint: (m, 3, joints) derivatives by the readings.
+        shared: (joints,) variance of the readings that the fixes of a standstill have in common, deg^2 or mm^2.
+        weight: (m,) probability that a row is no outlier.
     """
     root = np.sqrt(weight)
     factor = np.zeros((3 * len(root), 3 * int(np.diff(start).max(initial=1))))

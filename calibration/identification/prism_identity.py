@@ -1,7 +1,7 @@
-"""Identity of a target: the distances between places that the joints give tell the prisms of a machine apart.
+"""Identification of targets: distances between the prism positions that the joints imply distinguish the prisms.
 
-A base that stands still places all prisms by one rigid transform. Targets that are taken for the wrong prisms fit none:
-prisms are fixed to different links, or to different places of one.
+While the base stands still, one rigid transform places all prisms. Targets that are assigned to the wrong prisms fit no
+such transform, as prisms are fixed to different links or to different places on one link.
 """
 
 from __future__ import annotations
@@ -15,18 +15,18 @@ from calibration.kinematics.chain import Chain, ChainData, Integers, Placement
 from calibration.observations import Floats
 from calibration.rig.description import BEYOND_BUILDING, Rig
 
-SLACK_MM = 100.0  # what no build tolerance tells of: droop, backlash, a boom that sways, a prism that is mounted askew
+SLACK_MM = 100.0  # for errors that no build tolerance covers: droop, backlash, a swaying boom, a prism mounted askew
 
 
 @dataclass(frozen=True)
 class Targets:
-    """n places that a station measured from one set-up, each of a target that is taken for some prism.
+    """n positions that a station measured from one set-up, each of a target that is assumed to be some prism.
 
     Attributes:
         readings: (n, joints), deg or mm, in the rig's order of joints.
-        prism: (n,) index of the prism that each target is taken for.
+        prism: (n,) index of the prism that each target is assumed to be.
         position_mm: (n, 3) in the station's frame.
-        slack_mm: (n,) by how far each may be off since the boom moved.
+        slack_mm: (n,) additional tolerance for motion of the boom since the measurement.
     """
 
     readings: Floats
@@ -40,12 +40,12 @@ class Targets:
 
 @dataclass(frozen=True)
 class Misfits:
-    """Misfits of targets to each name, in units of what build tolerances and motion explain: up to 1 they do.
+    """Misfits of targets to each prism, in units of what build tolerances and motion explain: up to 1 is explained.
 
     Attributes:
-        prism: (prisms,) where the targets are that prism.
-        standing: where they are a reflector that stands beside the machine.
-        distance_mm: (prisms,) about how far the targets are from where the prism of each name would be.
+        prism: (prisms,) misfit if the targets are that prism.
+        standing: misfit if the targets are a reflector that stands next to the machine.
+        distance_mm: (prisms,) approximate distance of the targets from where each prism would be.
     """
 
     prism: Floats
@@ -54,10 +54,10 @@ class Misfits:
 
 
 class PrismIdentity:
-    """Tells which prism targets are.
+    """Identification of the prisms that targets are.
 
     Args:
-        rig: the machine; its nominal kinematics are used, and its build tolerances say how far a target may be off.
+        rig: the machine; its nominal kinematics and build tolerances are used.
     """
 
     def __init__(self, rig: Rig) -> None:
@@ -68,17 +68,17 @@ class PrismIdentity:
         )
 
     def own_misfits(self, targets: Targets) -> Floats:
-        """Return how badly targets (n,) fit the names that they have, in units of `Misfits`."""
+        """Return the (n,) misfits of targets to the prisms that they are assumed to be, in units of `Misfits`."""
         base_mm, errors_mm = self._seen(targets, targets.prism)
         limit_mm = self._limits_mm(errors_mm, targets.slack_mm)
         return _off_mm(base_mm, targets.position_mm) / limit_mm
 
     def misfits(self, known: Targets, unknown: Targets) -> Misfits:
-        """Return how badly targets fit each name.
+        """Return the misfits of targets to each prism.
 
         Args:
-            known: m targets whose names are relied on; may be none.
-            unknown: n targets that are all one and the same; their `prism` is not looked at.
+            known: m targets whose prisms are relied on; may be empty.
+            unknown: n measurements of one and the same target; their `prism` is ignored.
         """
         m, n = len(known), len(unknown)
         station_mm = np.concatenate([known.position_mm, unknown.position_mm])
@@ -91,19 +91,19 @@ class PrismIdentity:
             off_mm = _off_mm(np.concatenate([known_mm, own_mm]), station_mm)
             off = off_mm / limit_mm
             found.append(max(float(np.median(group)) for group in (off[:m], off[m:]) if len(group)))
-            # The transform lies between the groups; all of what it leaves is by the name of the second one.
+            # The transform lies between the groups, but all of its error is due to the prism of the second group.
             distances_mm.append(float(np.median(off_mm[m:])) * ((m + n) / m if m else 1.0))
         spread_mm = np.linalg.norm(unknown.position_mm - unknown.position_mm.mean(axis=0), axis=1)
         return Misfits(np.array(found), float(np.max(spread_mm) / SLACK_MM), np.array(distances_mm))
 
     def _seen(self, targets: Targets, prism: Integers) -> tuple[Floats, Floats]:
-        """Return places (n, 3) of prisms in the base frame, and what one build tolerance each moves them by, mm."""
+        """Return positions (n, 3) of prisms in the base frame and their displacements by one build tolerance, mm."""
         data = ChainData(targets.readings, prism, np.zeros(len(targets), dtype=np.intp))
         found = self._chain.linearise(self._x, data)
         return found.position_mm, found.jacobian * self._prior
 
     def _limits_mm(self, errors_mm: Floats, slack_mm: Floats) -> Floats:
-        """Return how far (n,) targets may be off, mm: what moves all of them alike is part of the rigid transform."""
+        """Return the (n,) tolerated errors of targets, mm; the rigid transform absorbs displacements common to all."""
         own_mm: Floats = np.sqrt(((errors_mm - errors_mm.mean(axis=0)) ** 2).sum(axis=(1, 2)))
         return BEYOND_BUILDING * own_mm + SLACK_MM + slack_mm
 

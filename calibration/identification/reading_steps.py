@@ -1,7 +1,7 @@
-"""Resolution of the encoders as the readings themselves show it: often coarser than the rig file says.
+"""Resolution of the encoders as seen in the readings, which is often coarser than in the rig file.
 
-Noise of one size along all axes is a poor stand-in for that of a coarse encoder, which is large across its lever arm
-and nothing along it: effects that are plain beside the one drown in the other.
+Noise of equal size along all axes is a poor approximation for the noise of a coarse encoder, which is large across the
+lever arm and zero along it. An effect that is plain with the right noise model drowns in the approximation.
 """
 
 from __future__ import annotations
@@ -18,20 +18,20 @@ from calibration.identification.solve import Solution
 from calibration.observations import Floats, Observations
 from calibration.rig.description import Rig
 
-_STEP_OFF = 0.02  # of a step, by which readings in steps may be off whole ones
-_IN_STEPS = 0.98  # of the readings
+_STEP_OFF = 0.02  # of a step: greatest distance of a reading from a whole number of steps
+_IN_STEPS = 0.98  # least share of the readings at whole steps
 _LEAST_VALUES = 8
 _COARSER = 1.5  # times the rig file's step
-_PART = 0.4  # of what a model leaves, and what a model leaves of it
+_PART = 0.4  # least ratio between rounding errors and a model's errors, either way
 
 
 def in_true_steps(solution: Solution, observations: Observations, prior: Prior) -> Solution:
-    """Refit a solution with the noise of readings in the steps that they come in, if the rig file has finer ones.
+    """Refit a solution with the resolution that the readings show, if it is coarser than the rig file's.
 
     Args:
         solution: of the kinematics alone, fitted to `observations`.
         observations: the rows.
-        prior: that it was found with.
+        prior: the prior with which `solution` was found.
     """
     rig = solution.chain.rig
     steps = _coarser(rig, observations)
@@ -43,16 +43,16 @@ def in_true_steps(solution: Solution, observations: Observations, prior: Prior) 
 
 
 def rounding(context: EffectContext, left_mm: float) -> tuple[float, str | None]:
-    """Find readings that are rounded, where that makes a good part of the errors that a model leaves.
+    """Find rounded readings, if the rounding explains a large part of a model's errors.
 
-    Poses that were planned in whole steps and read in all digits leave far less than their steps would.
+    Poses that were planned in whole steps but read with all digits leave much smaller errors than rounding would.
 
     Args:
         context: the rows.
-        left_mm: RMS 3-D error that the model leaves.
+        left_mm: RMS 3-D error of the model.
 
     Returns:
-        RMS 3-D error by the rounding, mm, and a sentence; 0 and None where it makes no good part.
+        RMS 3-D error due to the rounding, mm, and a sentence; 0 and None if that is not a large part.
     """
     rig = context.rig
     steps = _coarser(rig, context.observations)
@@ -73,13 +73,13 @@ def rounding(context: EffectContext, left_mm: float) -> tuple[float, str | None]
 
 
 def _coarser(rig: Rig, observations: Observations) -> dict[str, float]:
-    """Step of the readings by joint, where it is coarser than the rig file's."""
+    """Return the step of the readings of each joint where it is coarser than the rig file's."""
     steps = {joint.name: step_of(observations.joints[joint.name]) for joint in rig.joints}
     return {joint.name: steps[joint.name] for joint in rig.joints if steps[joint.name] > _COARSER * joint.resolution}
 
 
 def step_of(readings: Floats) -> float:
-    """Step in which a joint's readings (n,) come; 0 where none is seen."""
+    """Return the step between a joint's readings (n,), deg or mm; 0 if they are not in steps."""
     values = np.unique(readings)
     if len(values) < _LEAST_VALUES:
         return 0.0

@@ -1,11 +1,11 @@
-"""Gauss-Newton to the optimum: whitened residuals, build-tolerance priors, outliers weighted out, noise estimated.
+"""Gauss-Newton fit with whitened residuals, build-tolerance priors, downweighted outliers and estimated noise.
 
 The model of an observation: with probability 1 - epsilon its error is normal with the covariance
-Sigma_station + J_q Sigma_q J_q' + timing + s^2 I, else thirty times as wide; inliers of one standstill are correlated,
-as they share errors of its readings (`whitening`). s^2 is what the data's own scatter adds, so that small sigma
-columns never make the fit chase a few rows when what the kinematics lack dominates. It is found by restricted maximum
-likelihood (the parameters' degrees of freedom do not count as noise), epsilon by expectation-maximisation, and the
-prior's scale, where asked for, by MacKay's evidence update.
+Sigma_station + J_q Sigma_q J_q' + timing + s^2 I, else thirty times as wide. Inliers of one standstill are correlated,
+as they share errors of its readings (`whitening`). The excess variance s^2 is estimated from the scatter of the data,
+so that small sigma columns never make the fit follow a few rows when errors of the kinematic model dominate. It is
+found by restricted maximum likelihood (the parameters' degrees of freedom do not count as noise), epsilon by
+expectation-maximisation, and the prior's scale, if requested, by MacKay's evidence update.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ from calibration.observations import Floats
 Prior = Literal["recalibration", "as-built"]
 
 _ROUNDS = 100
-# Wide: a tenth of the rows a few sigma off are what the kinematics lack, which must raise s^2, and no outliers.
+# Wide: if a tenth of the rows is off by a few sigma, the kinematic model is wrong there; that must raise s^2 instead.
 _OUTLIER_WIDTH = 30.0
 _OUTLIER_SHARE = (1e-3, 0.4)
 _PRIOR_SCALE = (0.1, 300.0)
 _AS_BUILT_SCALE = 30.0
 _DAMPING = (1e-9, 1e-4, 1e9)  # least, first after a refused step, greatest
 _CONVERGED = 1e-3
-_SAME_NOISE = 0.01  # share by which noise or prior may change before what depends little on them is computed again
+_SAME_NOISE = 0.01  # relative change of noise or prior that triggers recomputing quantities that depend on them weakly
 _LEAST_EXCESS = 1e-12
 
 
@@ -48,14 +48,14 @@ class Fit:
 
     Attributes:
         x: (p,) parameters; with k additions (p + k,), their coefficients last.
-        covariance: of `x`, posterior of the model linearised there, the uncertainty of an estimated prior scale in it;
-            zero rows for what was held.
+        covariance: posterior covariance of `x` in the model linearised there, including the uncertainty of an estimated
+            prior scale; zero rows and columns for parameters that were held.
         excess_variance: s^2, mm^2 per axis.
-        prior_scale: what the build tolerances were multiplied by.
+        prior_scale: factor on the build tolerances.
         weight: (m,) probability that a sample is no outlier.
         cost: negative log evidence at the solution; lower is better on the same samples.
-        converged: False if the iteration ended before convergence.
-        rounds: iterations that it took, 0 where a method does not count them.
+        converged: whether the iteration converged.
+        rounds: number of iterations, 0 if a method does not count them.
     """
 
     x: Floats
@@ -85,40 +85,47 @@ def refine(
         chain: kinematics.
         samples: m rows.
         start: (p,) parameters; with k additions also (p + k,), else their coefficients start at zero.
-        free: which of them move; all by default, and all additions where it has p entries.
+        free: (p,) or (p + k,) mask of what to fit; all by default, and all coefficients if it has p entries.
         prior: trust the build tolerances, or estimate one factor on all of them.
         excess_variance: hold s^2 at this value instead of estimating it.
-        additions: coefficients to estimate along, with columns for the m rows.
-        like: a fit of nearly the same model, whose noise is where to begin; by default what `start` leaves tells it.
+        additions: k coefficients of effects to estimate in the same fit, with columns for the m rows.
+        like: a fit of nearly the same model that provides the initial noise, which is otherwise estimated at `start`.
 
     Raises:
         CalibrationError: the numbers left the range of floating point.
-        ValueError: additions for another number of rows.
+        ValueError: the number of rows of the additions differs from m.
     """
     return _fit(LinearModel(chain, samples, free, additions), start, prior, excess_variance, moves=True, like=like)
 
 
 def posterior(chain: Chain, samples: Samples, x: Floats, *, prior: Prior = "recalibration") -> Fit:
-    """Noise, outliers, covariance and cost as they are at `x` itself, for methods that search by other means.
+    """Estimate noise, outliers, covariance and cost at a fixed `x`, for parameters found by other methods.
 
-    Arguments and errors as `refine`.
+    Args:
+        chain: kinematics.
+        samples: m rows.
+        x: (p,) parameters.
+        prior: as in `refine`.
+
+    Raises:
+        CalibrationError: as `refine`.
     """
     return _fit(LinearModel(chain, samples), x, prior, None, moves=False)
 
 
 @dataclass(frozen=True)
 class WhitenedRows:
-    """m samples about a fit, in units of their noise; rows are sample-major, x, y, z of the first sample first.
+    """m samples linearised about a fit, in units of their noise; rows are x, y, z of the first sample, then the second.
 
     Attributes:
         error_mm: (m, 3) measured minus modelled.
         error: (3 m,) the same in units of the noise.
-        jacobian: (3 m, q) by parameters and coefficients, in prior sigmas of each.
-        value: (q,) where the fit has these, in prior sigmas.
-        precision_root: (q,) one over the prior sigmas.
-        joint_jacobian: (m, 3, joints) by reading, station's frame, mm per deg or mm.
-        parameter_jacobian: (m, 3, p) by parameter, mm per mm or rad.
-        whiten: function from displacements (m, 3, k) in mm to (3 m, k).
+        jacobian: (3 m, q) derivatives by parameters and coefficients, each in its prior sigmas.
+        value: (q,) fitted values of these, in prior sigmas.
+        precision_root: (q,) 1 / sigma of the priors.
+        joint_jacobian: (m, 3, joints) derivatives by readings in the station's frame, mm per deg or mm.
+        parameter_jacobian: (m, 3, p) derivatives by parameters, mm per mm or rad.
+        whiten: function that whitens displacements (m, 3, k) in mm to (3 m, k).
     """
 
     error_mm: Floats
@@ -142,8 +149,8 @@ def whitened_rows(
     Args:
         chain: kinematics.
         samples: m rows.
-        fit: of them.
-        additions: k coefficients of effects that were fitted along, with columns for the m rows.
+        fit: result of fitting `chain` to `samples`.
+        additions: k coefficients of effects in that fit, with columns for the m rows.
     """
     model = LinearModel(chain, samples, additions=additions)
     state = model.at(fit.x)
@@ -168,7 +175,7 @@ def whitened_rows(
 
 @dataclass(frozen=True)
 class _Noise:
-    """Quantities estimated beside the parameters."""
+    """Quantities estimated in addition to the parameters."""
 
     excess: float
     share: float
@@ -176,7 +183,7 @@ class _Noise:
 
 
 class _Posterior:
-    """The posterior around a state: outliers weighted, rows whitened, the quadratic model in what is free."""
+    """Quadratic model of the posterior about a state, with weighted outliers and whitened rows."""
 
     def __init__(self, model: LinearModel, state: Linearised, noise: _Noise) -> None:
         self.model, self.state, self.noise = model, state, noise
@@ -194,7 +201,7 @@ class _Posterior:
 
     @cached_property
     def factor(self) -> _Factor:
-        """LinAlgError where the normal equations cannot be factored."""
+        """Factor of the normal equations; LinAlgError if they are not positive definite."""
         return _Factor(self.normal)
 
     @cached_property
@@ -202,18 +209,18 @@ class _Posterior:
         return self.factor.inverse()
 
     def squares(self, at: Linearised) -> float:
-        """Weighted squares plus the prior's at another state, noise and weights as they are here."""
+        """Return the weighted squares plus the prior's at another state, with the noise and weights of this one."""
         whitened = self.whitening.whiten(at.error)
         return float((whitened**2).sum() + self.precision @ at.x[self.model.free] ** 2)
 
     @property
     def fitted_share(self) -> float:
-        """Share of tr V^-1 (dV/ds^2) that the parameters fit: tr V^-1 J C J' V^-1 (dV/ds^2), over the former."""
+        """Share of tr V^-1 (dV/ds^2) that the parameters fit: tr V^-1 J C J' V^-1 (dV/ds^2) divided by that."""
         jacobian = self.whitening.finish(self.jacobian)
         return float(np.vdot(gram(jacobian), self.covariance)) / self.whitening.trace[0]
 
     def excess(self, step: Floats, fitted_share: float) -> float:
-        """s^2 after a Fisher scoring step of the restricted likelihood, the parameters moved by `step` meanwhile.
+        """Return s^2 after a Fisher scoring step of the restricted likelihood, with the parameters moved by `step`.
 
         It equates e' V^-1 (dV/ds^2) V^-1 e with tr P (dV/ds^2), P = V^-1 - V^-1 J C J' V^-1.
         """
@@ -223,17 +230,17 @@ class _Posterior:
         if left <= 0.0:
             return self.noise.excess
         change = (float((error**2).sum()) - left) / (curvature * left / total)
-        # Downwards a single step may leave the range in which the quadratic model holds.
+        # A large step downwards may leave the range in which the quadratic model holds.
         return max(self.noise.excess + change, 0.1 * self.noise.excess, _LEAST_EXCESS)
 
     @property
     def determined(self) -> float:
-        """gamma: how many of the parameters with a build tolerance the data determine."""
+        """gamma: effective number of parameters with a build tolerance that the data determine."""
         inside = self.model.tolerated[self.model.free]
         return float(np.sum(1.0 - np.diag(self.covariance)[inside] * self.precision[inside]))
 
     def prior_scale(self, x: Floats) -> float:
-        """MacKay: scale^2 = sum of (x / sigma)^2 over the number of parameters that the data determine."""
+        """Return MacKay's estimate: scale^2 = sum of (x / sigma)^2 divided by the number of determined parameters."""
         inside = self.model.tolerated
         precision = self.precision[inside[self.model.free]]
         squares = float(precision @ x[inside] ** 2) * self.noise.scale**2
@@ -241,20 +248,20 @@ class _Posterior:
 
     @property
     def covariance_of_unsure_scale(self) -> Floats:
-        """The covariance where the prior's scale is estimated, and so uncertain itself.
+        """Covariance if the prior's scale is estimated and therefore uncertain.
 
-        Given squares of gamma determined parameters, scale^2 is inverse chi-square distributed: gamma / (gamma - 2)
-        times the estimate in the mean. What the data do not see is that much less certain.
+        Given the squares of gamma determined parameters, scale^2 has an inverse chi-square distribution whose mean is
+        gamma / (gamma - 2) times the estimate. The prior variance of what the data do not see grows by that factor.
         """
         inside = self.model.tolerated[self.model.free]
         mean = 1.0 + 2.0 / max(self.determined - 2.0, 1.0)
         return _Factor(self.normal - np.diag(np.where(inside, self.precision * (1.0 - 1.0 / mean), 0.0))).inverse()
 
     def cost(self) -> float:
-        """Negative log evidence (Laplace), up to a constant: fits of one data set from different starts compare by it.
+        """Return the negative log evidence (Laplace), up to a constant, to compare fits of one data set.
 
-        Every row's mixture by itself, plus what the correlation among the inliers of standstills adds. Far out an
-        outlier is as likely as by Cauchy's distribution: how far a gross one is tells nothing of the noise of others.
+        It is the sum over the mixtures of all rows, plus the contribution of correlation among inliers of standstills.
+        Outliers have the tails of a Cauchy distribution, as the size of a gross outlier says nothing about the noise.
         """
         rows, share = self.of_rows, self.noise.share
         inlier = math.log(1.0 - share) - 0.5 * (rows.square + rows.log_det)
@@ -276,7 +283,7 @@ def _fit(
     moves: bool,
     like: Fit | None = None,
 ) -> Fit:
-    """Alternate between the parameters (if it `moves`) and what is estimated beside them until all are at rest."""
+    """Alternate between the parameters (if `moves`) and noise, outliers and prior scale until all converge."""
     state = model.at(model.extended(start))
     _require_finite(state.error)
     noise = _first_noise(state, prior) if like is None else _noise_of(like)
@@ -314,20 +321,20 @@ def _fit(
 
 
 def _first_noise(state: Linearised, prior: Prior) -> _Noise:
-    """Noise by what a state leaves, whatever outliers there are."""
+    """Return a robust first estimate of the noise from the errors at a state."""
     robust = float(np.median(np.linalg.norm(state.error, axis=1))) / 1.54  # median of a 3-D normal's norm
     return _Noise(max(robust**2, _LEAST_EXCESS), 0.05, _AS_BUILT_SCALE if prior == "as-built" else 1.0)
 
 
 def _noise_of(fit: Fit) -> _Noise:
-    """Noise as a fit has found it."""
+    """Return the noise of a fit."""
     share = float(np.clip(1.0 - fit.weight.mean(), *_OUTLIER_SHARE))
     return _Noise(max(fit.excess_variance, _LEAST_EXCESS), share, fit.prior_scale)
 
 
 def _require_finite(values: Floats) -> None:
     if not np.isfinite(values).all():
-        raise CalibrationError("identification: the fit left the range of numbers; check units of the observations")
+        raise CalibrationError("identification: the fit left the range of floating point; check units of the data")
 
 
 def _inlier_probability(square: Floats, share: float) -> Floats:
@@ -337,18 +344,27 @@ def _inlier_probability(square: Floats, share: float) -> Floats:
 
 
 def damped_step(normal: Floats, gradient: Floats, damping: float) -> Floats:
-    """Levenberg-Marquardt step; LinAlgError where the matrix cannot be factored."""
+    """Return the Levenberg-Marquardt step (q,).
+
+    Args:
+        normal: (q, q) matrix of the normal equations.
+        gradient: (q,) their right-hand side.
+        damping: share of the diagonal that is added to it.
+
+    Raises:
+        LinAlgError: the damped matrix is not positive definite.
+    """
     return _Factor(normal + damping * np.diag(np.diag(normal))).solve(gradient)
 
 
 class _Factor:
-    """Cholesky factor of a matrix (q, q), scaled to a unit diagonal; LinAlgError where there is none."""
+    """Cholesky factor of a matrix (q, q) scaled to a unit diagonal; LinAlgError if it is not positive definite."""
 
     def __init__(self, matrix: Floats) -> None:
         self._scale = 1.0 / np.sqrt(np.diag(matrix))
         scaled = matrix * self._scale[:, None]
         scaled *= self._scale
-        # It is symmetric: its transpose is what LAPACK takes without a copy.
+        # As the matrix is symmetric, LAPACK can use its transpose without a copy.
         self._lower, failed = lapack.dpotrf(scaled.T, lower=1, overwrite_a=1)
         if failed:
             raise LinAlgError("the normal equations are not positive definite")
@@ -359,12 +375,12 @@ class _Factor:
         return 2.0 * float(np.log(np.diag(self._lower)).sum() - np.log(self._scale).sum())
 
     def solve(self, right: Floats) -> Floats:
-        """Solution of the linear system for a right-hand side (q,)."""
+        """Solve the linear system for a right-hand side (q,)."""
         solved: Floats = self._scale * cho_solve((self._lower, True), self._scale * right)
         return solved
 
     def inverse(self) -> Floats:
-        """Inverse of the matrix."""
+        """Return the inverse of the matrix."""
         whole = inverse_by(self._lower)
         whole *= self._scale[:, None]
         whole *= self._scale
@@ -372,7 +388,11 @@ class _Factor:
 
 
 def _step(view: _Posterior, damping: float) -> tuple[Linearised, float, Floats, float]:
-    """A damped step that does not raise the weighted squares: new state, next damping, the step, its size in sigma."""
+    """Take a damped step that does not raise the weighted squares.
+
+    Returns:
+        The new state, the next damping, the step, and its RMS size in sigma.
+    """
     state, free = view.state, view.model.free
     here = float(view.error @ view.error + view.precision @ state.x[free] ** 2)
     while damping < _DAMPING[2]:

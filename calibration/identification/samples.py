@@ -1,8 +1,8 @@
-"""Samples of a fit: the fixes of one standstill averaged, each with its measurement covariance.
+"""Samples of a fit: averages of the repeated fixes of a standstill, each with its measurement covariance.
 
-Fixes of one session, set-up, pose and prism are repeats: averaging them lowers the noise of station and readings, as
-far as it shows among them. What does not show is common to a standstill: no number of repeats averages it out, and in
-the readings it is the same at other prisms of the pose as well.
+Fixes of one session, set-up, pose and prism are repeats. Averaging them lowers that part of the noise of station and
+readings that is visible in their scatter. The remaining part is common to a standstill: no number of repeats averages
+it out, and that of the readings also affects the other prisms of the pose.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from calibration.rig.limits import turns_deg
 
 Integers = NDArray[np.intp]
 
-LEAST_STOPS = 5  # of a joint that is swept while others stand
+LEAST_STOPS = 5  # of a joint that is swept while the others stand still
 
-_LEAST_REPEATS = 10  # degrees of freedom below which the scatter of repeats says nothing
-_REPEAT_LIMIT = 6.0  # a repeat farther than so many sigma from its standstill's median stands alone
-_SPREAD = 10.0  # sigma between the lowest and the highest of some thousand readings of one value
-_GREATEST_LEVERAGE = 0.95  # beyond it the linearised fit says nothing any more
+_LEAST_REPEATS = 10  # degrees of freedom below which the scatter of repeats is too uncertain to use
+_REPEAT_LIMIT = 6.0  # sigma; a repeat farther from its standstill's median is a sample of its own
+_SPREAD = 10.0  # sigma between the lowest and the highest of a few thousand readings of one value
+_GREATEST_LEVERAGE = 0.95  # the linearised fit is not reliable beyond it
 
 
 @dataclass(frozen=True)
@@ -39,16 +39,16 @@ class Samples:
     """Rows of a fit.
 
     Attributes:
-        data: (m) bound readings, the mean of each standstill.
+        data: (m) readings, prisms and set-ups; readings are means over each sample's fixes.
         position_mm: (m, 3) mean position in the station's frame.
-        station_covariance: (m, 3, 3) of that mean, mm^2, without readings, timing and excess.
+        station_covariance: (m, 3, 3) covariance of that mean, mm^2, without readings, timing and excess.
         rates: (m, joints) deg/s or mm/s at the fix, 0 where not measured.
-        of_row: (n,) sample that each observation went into, a copy into that of its original.
-        repeat_variance: mm^2 per axis that repeats scatter beyond the station's covariance.
-        fixes: (m,) how many observations each is the mean of.
-        reading_scatter: (joints,) variance, deg^2 or mm^2, that readings show among repeats; 0 where these are too few.
-        standstill: (m,) samples with the same number share those random errors of their readings that repeats do not
-            show.
+        of_row: (n,) sample that each observation is part of; a copy belongs to the sample of its original.
+        repeat_variance: variance of repeats in excess of the station's covariance, mm^2 per axis.
+        fixes: (m,) number of observations averaged in each sample.
+        reading_scatter: (joints,) variance of readings among repeats, deg^2 or mm^2; 0 if there are too few repeats.
+        standstill: (m,) number of the standstill. Samples with the same number share those random errors of their
+            readings that repeats do not show.
     """
 
     data: ChainData
@@ -65,7 +65,7 @@ class Samples:
         return len(self.data)
 
     def select(self, rows: Integers | NDArray[np.bool_]) -> Samples:
-        """Samples by mask or by index, each as a standstill and an observation of its own."""
+        """Return samples by mask or index, each as a separate standstill with a single observation."""
         data = self.data.select(rows)
         return replace(
             self,
@@ -79,44 +79,44 @@ class Samples:
         )
 
     def average(self, values: Floats) -> Floats:
-        """(m, ...) means of `values` (n, ...) over the observations of each sample."""
+        """Return (m, ...) means of `values` (n, ...) over the observations of each sample."""
         return _averages(self.of_row, values)
 
     def shared_variance(self, rig: Rig) -> Floats:
-        """(joints,) variance of a standstill's readings that is common to all of its samples, deg^2 or mm^2."""
+        """Return the (joints,) variance of readings that is common to all samples of a standstill, deg^2 or mm^2."""
         shared: Floats = np.maximum(reading_variance(rig) - self.reading_scatter, 0.0)
         return shared
 
     def own_variance(self, rig: Rig) -> Floats:
-        """(m, joints) variance of each sample's mean readings beside the shared one, deg^2 or mm^2."""
+        """Return the (m, joints) variance of each sample's mean readings without the shared part, deg^2 or mm^2."""
         own: Floats = np.minimum(reading_variance(rig), self.reading_scatter) / self.fixes[:, None]
         return own
 
     def own_covariance(self, rig: Rig, joint_jacobian: Floats) -> Floats:
-        """(m, 3, 3) of each position without the part shared by its standstill, mm^2; arguments as `covariance`."""
+        """Return the (m, 3, 3) covariance without the part shared by a standstill, mm^2; arguments as `covariance`."""
         readings = covariance_by_joints(joint_jacobian, self.own_variance(rig))
         return self.station_covariance + readings + timing_covariance(rig, joint_jacobian, self.rates)
 
     def covariance(self, rig: Rig, joint_jacobian: Floats) -> Floats:
-        """(m, 3, 3) of each position by station, readings and the instant of the fix, mm^2.
+        """Return the (m, 3, 3) covariance of positions due to station, readings and timing of the fix, mm^2.
 
         Args:
-            rig: gives the random errors of readings and instant.
+            rig: gives the random errors of readings and timing.
             joint_jacobian: (m, 3, joints) mm per deg or mm.
         """
         shared = covariance_by_joints(joint_jacobian, self.shared_variance(rig))
         return shared + self.own_covariance(rig, joint_jacobian)
 
     def variance(self, rig: Rig, joint_jacobian: Floats) -> float:
-        """Mean variance of a coordinate, mm^2; arguments as `covariance`."""
+        """Return the mean variance of a coordinate, mm^2; arguments as `covariance`."""
         return float(np.trace(self.covariance(rig, joint_jacobian), axis1=1, axis2=2).mean()) / 3.0
 
 
 def averaged(chain: Chain, observations: Observations) -> Samples:
-    """Average the repeats of every standstill; repeats that disagree with it stay apart, copies count once.
+    """Average the repeats of every standstill; repeats that disagree become separate samples, copies count once.
 
     Raises:
-        DataError: a prism or set-up that the chain does not know.
+        DataError: the chain lacks a prism or set-up of the observations.
     """
     rig, turns = chain.rig, turns_deg(chain.rig)
     distinct, original = np.unique(originals(observations), return_inverse=True)
@@ -162,7 +162,7 @@ def _averages(of_row: Integers, values: Floats) -> Floats:
 
 
 def _differences(turns: Floats, change: Floats) -> Floats:
-    """(n, joints) changes of readings, deg or mm, without the whole turns (joints,) that leave the machine in place."""
+    """Return (n, joints) changes of readings, deg or mm, modulo whole turns where `turns` (joints,) is positive."""
     return np.where(turns > 0.0, (change + 180.0) % 360.0 - 180.0, change)
 
 
@@ -171,11 +171,11 @@ def _group_repeats(
 ) -> tuple[Integers, float, int]:
     """Group the repeats of each prism and standstill.
 
-    A row whose position or joints do not agree with the others of its standstill is a sample of its own: their mean
-    would be a place, or a joint value, that never was.
+    A row whose position or joints disagree with the others of its standstill becomes a separate sample: their mean
+    would be a position, or a joint value, that never occurred.
 
     Returns:
-        Sample of every row; sum of squared deviations within samples; its degrees of freedom.
+        Sample of every row, sum of squared deviations within samples, and its degrees of freedom.
     """
     position_mm = observations.position_mm
     from_middle = standing_spread(rig) / 2.0
@@ -190,7 +190,7 @@ def _group_repeats(
         if len(rows) > 1:
             distance = np.linalg.norm(position_mm[rows] - np.median(position_mm[rows], axis=0), axis=1)
             sigma = np.sqrt(np.trace(covariance[rows], axis1=1, axis2=2))
-            # The half-way point of two repeats proves neither wrong, so their own spread does not widen the limit.
+            # Both of two repeats are equally far from their median, so only with more may the spread widen the limit.
             spread = 3.0 * np.median(distance) if len(rows) > 2 else 0.0
             agrees = distance <= np.maximum(_REPEAT_LIMIT * sigma, spread)
             change = _differences(turns, readings[rows] - readings[rows[0]])
@@ -209,15 +209,22 @@ def _group_repeats(
 
 
 def _standstills(rig: Rig, turns: Floats, observations: Observations, means: ChainData, count: Integers) -> Integers:
-    """(m,) number of each sample's standstill, from one observation of each, mean readings and how many it averages.
+    """Return the (m,) number of each sample's standstill.
 
-    A standstill takes a prism in once: a second sample of it is one that disagreed. Where poses have no names, rows
-    with the very same readings of all joints are one standstill.
+    A standstill has at most one sample of a prism, as a second one is a repeat that disagreed. Where poses have no
+    names, rows with identical readings of all joints are one standstill.
+
+    Args:
+        rig: gives the spread of readings at a standstill.
+        turns: (joints,) whole turn of each joint, deg, or 0.
+        observations: m rows, one of each sample.
+        means: the samples' mean readings.
+        count: (m,) number of observations in each sample.
     """
     spread = standing_spread(rig)
     found = np.arange(len(means), dtype=np.intp)
     begun: dict[tuple[str, str, str], list[tuple[int, Floats, set[int]]]] = {}
-    # Most repeats first, so that the odd one out joins no others.
+    # Samples with most repeats first, so that a single outlying repeat cannot found a standstill that others join.
     for sample in np.argsort(-count, kind="stable").tolist():
         prism, readings = int(means.prism[sample]), means.readings[sample]
         pose = str(observations.pose[sample]) or readings.tobytes().hex()
@@ -236,12 +243,12 @@ def _standstills(rig: Rig, turns: Floats, observations: Observations, means: Cha
 
 
 def standing_spread(rig: Rig) -> Floats:
-    """(joints,) largest difference of two readings of a joint that did not move, deg or mm."""
+    """Return the (joints,) largest difference of two readings of a joint that did not move, deg or mm."""
     return np.array([_SPREAD * joint.sigma + 2.0 * joint.resolution for joint in rig.joints])
 
 
 def stops(readings: Floats, spread: float) -> Integers:
-    """(n,) number of the stop, from 0, that each of the rising readings (n,) of a joint belongs to.
+    """Return the (n,) number of the stop, from 0, to which each of a joint's ascending readings (n,) belongs.
 
     `spread` is that joint's `standing_spread`.
     """
@@ -267,24 +274,24 @@ def left_out_errors(
     excess_variance: float,
     groups: Integers | None = None,
 ) -> Floats:
-    """Estimate the errors that samples would have, had the fit not seen their group.
+    """Estimate the errors that samples would have if their group had been left out of the fit.
 
-    A fit follows each of its samples a little. In the fit linearised where it came to rest, sample errors e of a
-    group become V (V - J C J')^-1 e when it is left out (leave-one-out residuals, Cook & Weisberg 1982, extended
-    to blocks and a prior), with their noise V, their derivatives J and the posterior covariance C.
+    A fit follows each of its samples a little. In the fit linearised at its solution, the errors e of a group become
+    V (V - J C J')^-1 e when the group is left out (leave-one-out residuals, Cook & Weisberg 1982, extended to blocks
+    and a prior). V is the noise of the group, J are its derivatives and C is the posterior covariance.
 
     Args:
-        rig: gives the random errors of readings and of the fix's instant.
-        samples: m rows that the fit saw.
-        error_mm: (m, 3) errors of the fit, or what is left of them.
-        jacobian: (m, 3, p) by everything that was fitted.
+        rig: gives the random errors of readings and of the timing of a fix.
+        samples: m rows of the fit.
+        error_mm: (m, 3) errors of the fit, or what a further model leaves of them.
+        jacobian: (m, 3, p) derivatives by everything that was fitted.
         joint_jacobian: (m, 3, joints) mm per deg or mm.
-        covariance: (p, p) posterior.
-        excess_variance: mm^2 per axis that the samples scatter beyond station and readings.
-        groups: (m,) samples that are left out together; by default those of one standstill.
+        covariance: (p, p) posterior covariance.
+        excess_variance: variance of the samples in excess of station and readings, mm^2 per axis.
+        groups: (m,) group number of each sample; by default its standstill.
 
     Returns:
-        (m, 3), mm.
+        (m, 3) errors, mm.
     """
     own = samples.own_covariance(rig, joint_jacobian) + excess_variance * np.eye(3)
     by_reading = joint_jacobian * np.sqrt(samples.shared_variance(rig))

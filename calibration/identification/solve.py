@@ -1,4 +1,4 @@
-"""The whole identification: start in closed form, descend, search globally, judge, say what stays unknown."""
+"""The complete identification: closed-form start, local and global search, checks, and identifiability."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ from calibration.rig.description import ANOTHER_VALUE, Rig
 from calibration.run_settings import Run
 
 _BETTER = 1.0  # in log evidence; less is rounding
-_MISTAKES = 3  # supposed together where nothing else explains the data
-_SUSPICIOUS = 0.3  # mean error after the fit over what build tolerances explain before it
+_MISTAKES = 3  # most simultaneous faults to try when the fit does not explain the data
+_SUSPICIOUS = 0.3  # mean error after the fit, divided by what build tolerances explain before it
 
 
 @dataclass(frozen=True)
@@ -47,14 +47,14 @@ class Solution:
 
     Attributes:
         chain: kinematics with the bases placed.
-        samples: what was fitted.
-        nominal: base and unknown prism offsets alone.
-        fit: everything.
-        identifiability: what the data see.
-        search: how the global search and the local one from the nominal model compare, in words.
+        samples: rows of the fit.
+        nominal: fit of the bases and unknown prism offsets alone.
+        fit: fit of all parameters.
+        identifiability: which parameters the data determine.
+        search: comparison of the global search with the local one from the nominal model, in words.
         tolerated_mm: RMS 3-D error that build tolerances explain before any fit.
-        warnings: about the data and what was made of them.
-        additions: coefficients of effects that were fitted along; they follow the parameters in `fit.x`.
+        warnings: warnings about the data and the fit.
+        additions: coefficients of effects in the same fit; they follow the parameters in `fit.x`.
         has_priors: whether the rig file's build tolerances held the parameters.
     """
 
@@ -71,10 +71,10 @@ class Solution:
 
 
 def place(rig: Rig, observations: Observations) -> tuple[Chain, Samples, Start]:
-    """Place the base of every set-up; return the chain, the rows to fit and the rough start.
+    """Place the base of every set-up; return the chain, the samples to fit and the rough start.
 
     Raises:
-        DataError, UnsafeError: as `averaged` and `rough_start`, which lets mirrored coordinates pass here.
+        DataError, UnsafeError: as `averaged` and `rough_start`, but mirrored coordinates are accepted here.
     """
     setups = sorted(set(observations.setup.tolist()))
     blank = Chain(rig, {setup: Placement.identity() for setup in setups})
@@ -90,12 +90,12 @@ def solve(rig: Rig, observations: Observations, *, prior: Prior, run: Run) -> So
         rig: the rig description.
         observations: rows with positions.
         prior: trust the build tolerances, or estimate their scale.
-        run: of the global search, whose best candidate so far is refined where it is stopped.
+        run: settings of the global search. If it is stopped, its best candidate so far is refined.
 
     Raises:
         DataError: a prism that the rig lacks.
         UnsafeError: too few fixes, a set-up whose base cannot be placed, mirrored coordinates, another rig's data, a
-            joint's sign or unit that the rig file has otherwise, exchanged columns.
+            joint's sign or unit that differs from the rig file, exchanged columns.
     """
     run.progress(0.0, "placing the base")
     require_enough(rig, observations)
@@ -108,14 +108,14 @@ def solve(rig: Rig, observations: Observations, *, prior: Prior, run: Run) -> So
     fit = _descend(chain, samples, nominal.x, prior)
     run.progress(0.3, "searching globally")
     if at_the_noise(chain, samples, fit):
-        search = "no global search: what is left from the nominal model on is what instruments and repeats explain"
+        search = "no global search: instruments and repeats explain what the fit from the nominal model leaves"
     else:
         fit, search, trouble = _searched(chain, samples, nominal, fit, start.scale_mm, prior, run)
         warnings += trouble
     tolerated_mm = rms_tolerated_mm(chain, samples, nominal)
     misfits = mean_error_mm(chain, samples, fit) > _SUSPICIOUS * tolerated_mm
     if misfits or beyond_assembly(chain, fit):
-        run.progress(0.8, "looking for signs, units and zeros that are otherwise")
+        run.progress(0.8, "looking for wrong signs, units and zeros")
         found = diagnose(
             chain,
             samples,
@@ -125,12 +125,13 @@ def solve(rig: Rig, observations: Observations, *, prior: Prior, run: Run) -> So
             at_once=_MISTAKES if misfits else 1,
         )
         if found is not None and (prior != "as-built" or found.x is None):
-            raise UnsafeError(f"data and rig file do not fit each other: {found}")
+            raise UnsafeError(f"data and rig file do not match: {found}")
         if found is not None and found.x is not None:
             other = refine(found.chain, samples, found.x, prior=prior)
             if other.cost < fit.cost - _BETTER:
-                warnings.append(f"{found.what}: the model makes that good; correct the rig file")
-                chain, fit, search = found.chain, other, f"{found.what}: a start that knows led to a better optimum"
+                warnings.append(f"{found.what}: the model corrects that; correct the rig file")
+                chain, fit = found.chain, other
+                search = f"{found.what}: a start corrected for that led to a better optimum"
                 flat = np.isinf(chain.prior_sigma)
                 nominal = refine(chain, samples, np.where(flat, found.x, 0.0), free=flat)
     chain, fit = _without_wrong_tolerances(chain, samples, fit, prior)
@@ -145,10 +146,10 @@ def solve(rig: Rig, observations: Observations, *, prior: Prior, run: Run) -> So
 
 
 def _without_wrong_tolerances(chain: Chain, samples: Samples, fit: Fit, prior: Prior) -> tuple[Chain, Fit]:
-    """Refit without holding to the rig file the values that it has wrong, such as zeros set anew.
+    """Refit with wider tolerances of values that are wrong in the rig file, such as zeros that have been set again.
 
-    A tolerance that pulls by so much bends all the others, and what it is off would pass for an effect. The new one is
-    the distance itself, which makes the fit most probable.
+    A tolerance that is exceeded by so much distorts all other parameters, and the error left would pass for an effect.
+    The new tolerance is the distance from the rig file itself, which makes the fit most probable.
     """
     if prior == "as-built":
         return chain, fit
@@ -161,7 +162,7 @@ def _without_wrong_tolerances(chain: Chain, samples: Samples, fit: Fit, prior: P
 
 
 def _descend(chain: Chain, samples: Samples, start: Floats, prior: Prior) -> Fit:
-    """Descend to the optimum that a start leads to: roughly with no row left out, then exactly."""
+    """Descend from a start to its optimum: roughly without leaving out any rows, then exactly."""
     near = approach(chain, samples, start, precision=prior_precision(chain, PRIOR_SCALE[prior]))
     return refine(chain, samples, near, prior=prior)
 
@@ -175,24 +176,24 @@ def _searched(
     prior: Prior,
     run: Run,
 ) -> tuple[Fit, str, tuple[str, ...]]:
-    """Take the best of the local fit and those that single-joint sweeps and the global search lead to.
+    """Return the best of the local fit and the fits that start from single-joint sweeps and from the global search.
 
     Returns:
-        The fit; words for which it is; warnings of the checkpoint.
+        The fit, a description of where it came from, and warnings about the checkpoint.
     """
-    origin = "the nominal model leads"
-    # Their start takes seconds; where the local fit explains the data, it would only lead there again.
+    origin = "the fit from the nominal model"
+    # A start from sweeps takes seconds, and where the local fit explains the data it leads to the same optimum.
     misfits = mean_error_mm(chain, samples, local) > _SUSPICIOUS * rms_tolerated_mm(chain, samples, nominal)
     axes = find_axes(chain, samples) if misfits or beyond_assembly(chain, local) else ()
     if axes:
         swept = _descend(chain, samples, start_from_axes(chain, samples, axes), prior)
         if swept.cost < local.cost - _BETTER:
-            local, origin = swept, "the axes of single-joint sweeps lead"
+            local, origin = swept, "the fit from the axes of single-joint sweeps"
     x, search = search_globally(chain, samples, nominal.x, local.x, scale_mm, prior, run.part(0.3, 0.75))
     ended = "" if search.complete else ", which was stopped before its end,"
     if x is not None:
         run.progress(0.75, "refining")
         distant = _descend(chain, samples, x, prior)
         if distant.cost < local.cost - _BETTER:
-            return distant, f"the global search{ended} found a better optimum than where {origin}", search.warnings
-    return local, f"the global search{ended} found nothing better than where {origin}", search.warnings
+            return distant, f"the global search{ended} found a better optimum than {origin}", search.warnings
+    return local, f"the global search{ended} found nothing better than {origin}", search.warnings

@@ -1,6 +1,6 @@
-"""The start of the fit: base placements in closed form on nominal kinematics, and a robust descent towards the optimum.
+"""Start of the fit: closed-form base placements on nominal kinematics, and a robust descent towards the optimum.
 
-The rigid transform is Kabsch's (Acta Cryst. A32, 1976), reweighted so that gross outliers do not tilt it.
+The rigid transform follows Kabsch (Acta Cryst. A32, 1976), reweighted so that gross outliers do not tilt it.
 """
 
 from __future__ import annotations
@@ -20,19 +20,19 @@ from calibration.identification.samples import Samples
 from calibration.kinematics.chain import Chain, ChainData, Integers, Placement
 from calibration.observations import Floats
 
-PRIOR_SCALE = {"recalibration": 1.0, "as-built": 30.0}  # of the build tolerances while their scale is not known yet
+PRIOR_SCALE = {"recalibration": 1.0, "as-built": 30.0}  # factor on the build tolerances before it is estimated
 
 _PLACING_ROUNDS = 200
 _PLACED = 1e-3  # of the misfit
-_LINE = 1e-3  # second singular value over the first below which points lie on a line
-_MIRRORED = 0.3
+_LINE = 1e-3  # ratio of the second singular value to the first, below which points lie on a line
+_MIRRORED = 0.3  # misfit as the mirror image, relative to that as given, below which coordinates are mirrored
 _LEAST_OF_SETUP = 6  # rows
 
-_ROWS = 300  # enough to lead the way
+_ROWS = 300  # enough to find the neighbourhood of the optimum
 _ROUNDS = 80
-_QUANTILE = 0.7  # of the errors: above half, so that one prism's rows cannot leave the others out
+_QUANTILE = 0.7  # of the errors; above 0.5, so that the rows of one prism cannot outweigh all others
 _NORMAL_QUANTILE = 1.914  # of the norm of three standard normal numbers
-_LIMIT = 4.0  # standard deviations beyond which a row counts less and less
+_LIMIT = 4.0  # standard deviations beyond which the weight of a row decreases
 _DAMPING = (1e-3, 1e-9, 1e9)  # at first, least, most
 _SETTLED = 1e-3
 _PATIENCE = 3
@@ -44,9 +44,9 @@ class Start:
 
     Attributes:
         placements: placement of the base, by set-up.
-        x: (p,) parameters, with the offsets of unknown prisms.
-        scale_mm: robust size of the 3-D misfit there.
-        misfit_mm: (m,) 3-D misfit of each sample there.
+        x: (p,) parameters, including the offsets of unknown prisms.
+        scale_mm: median 3-D misfit with these.
+        misfit_mm: (m,) 3-D misfit of each sample with these.
     """
 
     placements: dict[str, Placement]
@@ -56,9 +56,13 @@ class Start:
 
 
 def rigid_fit(base_mm: Floats, station_mm: Floats, weight: Floats, *, mirrored: bool = False) -> Placement:
-    """Least-squares rotation and translation from (n, 3) points to (n, 3) points with (n,) weights.
+    """Return the least-squares rotation and translation from one set of points to another.
 
-    `mirrored` allows the improper rotation instead, which no rigid body makes.
+    Args:
+        base_mm: (n, 3) points to move.
+        station_mm: (n, 3) points to reach.
+        weight: (n,) weight of each squared distance.
+        mirrored: whether to return the best improper rotation instead, which no motion of a rigid body produces.
     """
     total = weight.sum()
     from_centre = weight @ base_mm / total
@@ -79,19 +83,19 @@ def rough_start(
     rounds: int = _PLACING_ROUNDS,
     in_base_mm: Floats | None = None,
 ) -> Start:
-    """Place every base, alternating with the offsets of prisms whose mounting is unknown.
+    """Place every base, in alternation with estimating the offsets of prisms whose mounting is unknown.
 
     Args:
         chain: kinematics whose placements are all the identity.
         samples: rows of every set-up of the chain.
-        x: (p,) parameters to begin with; those of the bases are zero.
-        offsets: False to leave the offsets of prisms as `x` has them.
+        x: (p,) initial parameters; those of the bases are zero.
+        offsets: whether to estimate offsets of prisms; if not, those of `x` are kept.
         mirrored: what to do about coordinates that fit much better as their mirror image.
-        rounds: of reweighting at most.
-        in_base_mm: (m, 3) positions in the frames of the bases at `x`, where they are known already.
+        rounds: greatest number of reweighting rounds.
+        in_base_mm: (m, 3) positions in the frames of the bases at `x`; computed if not given.
 
     Raises:
-        UnsafeError: a set-up with fewer than three fixes, with all fixes on a line, or mirrored.
+        UnsafeError: a set-up has fewer than three fixes, or all fixes on a line, or mirrored coordinates.
     """
     data = samples.data
     unknown = np.array([offsets and p.kind == "prism" and p.is_flat for p in chain.parameters])
@@ -110,7 +114,7 @@ def rough_start(
         for placement, rows in zip(placements, rows_of, strict=True):
             base[rows] = (samples.position_mm[rows] - placement.translation_mm) @ placement.rotation
         misfit = base - point
-        # Least absolute distances by reweighting: 20 % of gross outliers leave it where it is.
+        # Least absolute distances by reweighting, which 20 % of gross outliers do not disturb.
         distance = np.linalg.norm(misfit, axis=1)
         scale = float(np.median(distance))
         weight = 1.0 / np.maximum(distance, max(0.1 * scale, 1e-6))
@@ -134,22 +138,22 @@ def rough_start(
 
 
 def refuse_mirrored(chain: Chain, samples: Samples) -> None:
-    """UnsafeError where the coordinates are mirrored: no method can know it from a bad fit."""
+    """Raise UnsafeError if the coordinates are mirrored, which otherwise only shows as a bad fit."""
     blank = Chain(chain.rig, {setup: Placement.identity() for setup in chain.setups})
     rough_start(blank, samples, np.zeros(len(blank)))
 
 
 def draw_rows(data: ChainData, position_mm: Floats, count: int, seed: int) -> Integers:
-    """Rising numbers of about `count` rows, drawn at random, that stand for all of them.
+    """Return the ascending indices of about `count` rows, drawn at random, as a sample of all rows.
 
-    A set-up with too few of them, or with all of them on a line, gets more, so that no base is left to chance: six rows
-    and two dimensions, as far as it has them.
+    If fewer than six rows of a set-up are drawn, or all of its rows drawn lie on a line, more of its rows are added if
+    there are any, so that the placement of its base is not left to chance.
 
     Args:
         data: n rows.
-        position_mm: (n, 3) of them.
-        count: of rows; all are taken where there are no more.
-        seed: of the draw.
+        position_mm: (n, 3) measured positions.
+        count: number of rows; all are returned if there are no more.
+        seed: seed of the draw.
     """
     order = np.random.default_rng(seed).permutation(len(data))
     taken = np.zeros(len(data), dtype=bool)
@@ -164,7 +168,7 @@ def draw_rows(data: ChainData, position_mm: Floats, count: int, seed: int) -> In
 
 
 def _on_a_line(position_mm: Floats) -> bool:
-    """True if points (n, 3) leave a turn about them open: fewer than three, or all on a line."""
+    """Return True if points (n, 3) do not fix a rotation about them: fewer than three, or all on a line."""
     if len(position_mm) < 3:
         return True
     spread = np.linalg.svd(position_mm - position_mm.mean(axis=0), compute_uv=False)
@@ -172,14 +176,14 @@ def _on_a_line(position_mm: Floats) -> bool:
 
 
 def in_words(setup: str, alone: str = "the data") -> str:
-    """Name of a set-up in a message; `alone` for the only one, which has none."""
+    """Return words for a set-up in a message; `alone` for a single set-up without a name."""
     return f"set-up {setup!r}" if setup else alone
 
 
 def _check_spread(setup: str, position_mm: Floats) -> None:
     if len(position_mm) < 3:
         fixes = "1 fix" if len(position_mm) == 1 else f"{len(position_mm)} fixes"
-        raise UnsafeError(f"{in_words(setup)}: {fixes} cannot place the base; at least 3 in different places")
+        raise UnsafeError(f"{in_words(setup)}: {fixes} cannot place the base; measure 3 or more in different places")
     if np.ptp(position_mm, axis=0).max() == 0.0:
         raise UnsafeError(
             f"{in_words(setup)}: all {len(position_mm)} fixes have the same coordinates: did the station repeat one, "
@@ -217,21 +221,21 @@ def approach(
     free: NDArray[np.bool_] | None = None,
     rounds: int = _ROUNDS,
 ) -> Floats:
-    """Descend from afar to the neighbourhood of the optimum: damped Gauss-Newton with an outlier limit that narrows.
+    """Descend from a distant start to near the optimum: damped Gauss-Newton with an outlier limit that narrows.
 
-    The refinement's mixture decides early which rows are outliers. Where the model is metres off that decision is a
-    guess, and the fit comes to rest on the rows that it guessed for. Here nothing is decided: the limit beyond which a
-    row loses influence is a multiple of an upper quantile of all errors, wide open at first and closing as the model
-    comes closer (graduated non-convexity: Blake and Zisserman, "Visual Reconstruction", 1987; the loss is Geman and
+    The refinement's mixture decides early which rows are outliers. While the model is metres off, that decision is a
+    guess, and the fit converges to the rows guessed to be inliers. Here no row is classified: the limit beyond which a
+    row loses influence is a multiple of an upper quantile of all errors, wide at first and narrowing as the model
+    improves (graduated non-convexity: Blake and Zisserman, "Visual Reconstruction", 1987; the loss is Geman and
     McClure's).
 
     Args:
         chain: kinematics.
-        samples: m rows, of which some are used.
+        samples: m rows, of which about 300 are used.
         start: (p,) parameters.
         precision: (p,) 1 / sigma^2 of the prior.
-        free: (p,) which parameters move; all by default.
-        rounds: steps at most.
+        free: (p,) mask of the parameters to fit; all by default.
+        rounds: greatest number of steps.
 
     Returns:
         (p,) parameters.
@@ -254,7 +258,7 @@ def approach(
         here = _loss(error, scale) + float(prior @ x[free] ** 2)
         while True:
             there = x.copy()
-            with suppress(LinAlgError):  # no step costs no more
+            with suppress(LinAlgError):  # without a step the cost stays the same
                 there[free] += damped_step(normal, gradient, damping)
             moved = position - chain.positions_mm(there, data)
             cost = _loss(moved, scale) + float(prior @ there[free] ** 2)
@@ -278,12 +282,12 @@ def _square(error: Floats) -> Floats:
 
 
 def _scale(error: Floats, least: float) -> float:
-    """Standard deviation of a coordinate that the quantile of the errors stands for, `least` at least."""
+    """Return the standard deviation of a coordinate implied by the quantile of the errors, at least `least`."""
     return max(math.sqrt(float(np.quantile(_square(error), _QUANTILE))) / _NORMAL_QUANTILE, least)
 
 
 def _loss(error: Floats, scale: float) -> float:
-    """Geman and McClure's loss in units of squared sigma; infinite where the numbers left the range."""
+    """Return Geman and McClure's loss in units of squared sigma; infinite if it is out of range."""
     square = _square(error) / scale**2
     loss = float(np.sum(square / (1.0 + square / _LIMIT**2)))
     return loss if math.isfinite(loss) else math.inf

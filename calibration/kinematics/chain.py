@@ -1,8 +1,8 @@
 """Kinematics of any rig as a sequence of elementary transforms, with analytic Jacobians.
 
 Every convention, coupling, fixed transform, base placement and prism offset becomes a list of rotations about and
-translations along x, y or z. The compiled loops over that list (`chain_loops`) are the one forward kinematics of fits,
-predictions and loads; only the fitness of whole populations has its own (`fitness`), which is many times faster there.
+translations along x, y or z. The compiled loops over that list (`chain_loops`) are the forward kinematics of all fits,
+predictions and loads. Only the fitness of whole populations has its own (`fitness`), which is many times faster there.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from calibration.rig.description import Convention, Rig, Row, RowParameter
 
 Integers = NDArray[np.intp]
 
-PLAIN: Sequence[Literal["C", "A", "W"]] = ("C", "A", "W")  # the kind of array that numba compiles for
+PLAIN: Sequence[Literal["C", "A", "W"]] = ("C", "A", "W")  # requirements for arrays that are passed to numba
 
 X, Y, Z = 0, 1, 2
 _ANGLES: frozenset[RowParameter] = frozenset({"alpha", "theta", "beta"})
@@ -42,11 +42,11 @@ class Parameter:
     """One constant of the chain, as a deviation from its nominal value.
 
     Attributes:
-        name: `row4.theta`, `prism.r.y`, `base[s1].rx` (`base.rx` where set-ups have no name).
+        name: for example `row4.theta`, `prism.r.y`, `base[s1].rx` (`base.rx` if the set-up has no name).
         unit: `mm` or `rad`.
-        prior_sigma: build tolerance, 1 sigma, in `unit`; infinity for what nobody knows beforehand (base placements,
-            prisms whose mounting is unknown).
-        kind: which part of the rig it belongs to.
+        prior_sigma: build tolerance, 1 sigma, in `unit`; infinity for constants that are not known beforehand (base
+            placements, prisms whose mounting is unknown).
+        kind: part of the rig to which it belongs.
     """
 
     name: str
@@ -56,7 +56,7 @@ class Parameter:
 
     @property
     def is_flat(self) -> bool:
-        """True where no build tolerance limits the parameter."""
+        """True if no build tolerance limits the parameter."""
         return math.isinf(self.prior_sigma)
 
 
@@ -82,11 +82,11 @@ class Op:
 
     @property
     def is_identity(self) -> bool:
-        """True where the transform never does anything."""
+        """True if the transform is always the identity."""
         return self.constant == 0.0 and self.parameter < 0 and not self.drive
 
     def driven(self, readings: Floats) -> Floats:
-        """Return the constant and driven part (n,) of the size for readings (n, joints)."""
+        """Return the (n,) size without its parameter for readings (n, joints)."""
         size = np.full(len(readings), self.constant)
         for joint, coefficient in self.drive:
             size += coefficient * readings[:, joint]
@@ -95,11 +95,11 @@ class Op:
 
 @dataclass(frozen=True)
 class Placement:
-    """Place of a rig's base in a station's frame: P_station = rotation @ P_base + translation_mm.
+    """Placement of a rig's base in a station's frame: P_station = rotation @ P_base + translation_mm.
 
     Attributes:
-        rotation: (3, 3).
-        translation_mm: (3,) of the base frame's origin.
+        rotation: (3, 3) rotation matrix.
+        translation_mm: (3,) position of the base frame's origin.
     """
 
     rotation: Floats
@@ -141,9 +141,9 @@ class Linearisation(NamedTuple):
     """Positions with their derivatives.
 
     Attributes:
-        position_mm: (n, 3) in the station's frame.
-        jacobian: (n, 3, p) by parameter, mm per mm or rad.
-        joint_jacobian: (n, 3, joints) by reading, mm per deg or mm.
+        position_mm: (n, 3) positions in the station's frame.
+        jacobian: (n, 3, p) derivatives by parameters, mm per mm or rad.
+        joint_jacobian: (n, 3, joints) derivatives by readings, mm per deg or mm.
     """
 
     position_mm: Floats
@@ -152,13 +152,13 @@ class Linearisation(NamedTuple):
 
 
 class _Tables:
-    """Runs of transforms, and prisms, as the compiled loops take them.
+    """Tables of transforms and prisms for the compiled loops.
 
     Args:
-        runs: of transforms, one after the other; run number 1 ends in frame 1.
-        before: frame that each run continues from, 0 for the base.
-        offsets: of every prism its three translations.
-        frames: that the prisms are fixed to.
+        runs: sequences of transforms; run number k ends in frame k.
+        before: frame at which each run starts, 0 for the base.
+        offsets: three translations of every prism.
+        frames: frame to which every prism is fixed.
         paths: numbers of the runs between the base and each prism.
     """
 
@@ -195,7 +195,7 @@ class _Tables:
         self._offset_parameters = self._points.parameter[:, None] + np.arange(3)
 
     def at(self, x: Floats) -> tuple[Transforms, Points]:
-        """Return both at parameters (p,)."""
+        """Return the tables of transforms and prisms at parameters (p,)."""
         amount, nominal = np.empty((len(self._nominal), 3)), self._points
         chain_loops.settle(x, self._transforms.kind, self._nominal, amount)
         offset = nominal.offset + x[self._offset_parameters]
@@ -207,13 +207,13 @@ class Chain:
 
     Args:
         rig: the rig description.
-        placements: set-up -> where the base stands; base parameters are deviations from it.
+        placements: set-up -> placement of the base; base parameters are deviations from it.
 
     Attributes:
-        parameters: every identifiable constant; the vector `x` of all methods has their order.
+        parameters: every identifiable constant, in the order of the vector `x` of all methods.
         joint_index: name of a joint -> its column among the readings.
-        row_ops: per row its elementary transforms.
-        prism_ops: per prism its three offset translations.
+        row_ops: elementary transforms of each row.
+        prism_ops: three offset translations of each prism.
     """
 
     def __init__(self, rig: Rig, placements: Mapping[str, Placement]) -> None:
@@ -239,7 +239,7 @@ class Chain:
         own = [paths[prism.frame] for prism in rig.prisms]
         before = [(0, *path)[-2] for path in paths[1:]]
         self._tree = _Tables(self.row_ops, before, self.prism_ops, [prism.frame for prism in rig.prisms], own)
-        # For the prisms alone, each path is one long row: no frames are kept on the way.
+        # For positions of prisms alone, each path is one long row, so that no intermediate frames are stored.
         whole = [[op for number in path for op in self.row_ops[number - 1]] for path in own]
         numbers = range(1, len(whole) + 1)
         self._straight = _Tables(whole, [0] * len(whole), self.prism_ops, numbers, [(number,) for number in numbers])
@@ -253,7 +253,7 @@ class Chain:
 
     @property
     def prior_sigma(self) -> Floats:
-        """(p,) build tolerances; infinity where there is none."""
+        """(p,) build tolerances; infinity for parameters without one."""
         return np.array([p.prior_sigma for p in self.parameters])
 
     def with_tolerances(self, sigma: Mapping[str, float]) -> Chain:
@@ -263,7 +263,7 @@ class Chain:
         return chain
 
     def of(self, rig: Rig) -> Chain:
-        """Return the kinematics of another rig on the same bases; parameters that both have keep their tolerances."""
+        """Return the kinematics of a different rig on the same bases; common parameters keep their tolerances."""
         return Chain(rig, self.placements).with_tolerances({p.name: p.prior_sigma for p in self.parameters})
 
     def index(self, name: str) -> int:
@@ -321,14 +321,14 @@ class Chain:
         """Bind observations to the chain: readings in its order of joints, indices of prisms and set-ups.
 
         Raises:
-            DataError: a prism that the rig lacks, a set-up without a placement, a joint without readings or with one
-                that is no number.
+            DataError: the rig lacks a prism, a set-up has no placement, or a joint has no readings or one that is not
+                finite.
         """
         try:
             readings = np.array([observations.joints[name] for name in self.joint_index], dtype=np.float64)
         except KeyError:
             lacking = min(self.joint_index.keys() - observations.joints.keys())
-            raise DataError("observations", f"joint {lacking} is missing; are they another rig's?") from None
+            raise DataError("observations", f"joint {lacking} is missing; do they belong to another rig?") from None
         if not np.isfinite(readings).all():
             joint, row = np.argwhere(~np.isfinite(readings))[0]
             column = self.rig.joints[joint].column
@@ -343,12 +343,12 @@ class Chain:
     # -- evaluation ---------------------------------------------------------------------------------------------
 
     def base(self, x: Floats, setup: int) -> Placement:
-        """Return where the base stands at a set-up, with the deviations of `x` (p,) applied."""
+        """Return the placement of the base at a set-up, including the deviations in `x` (p,)."""
         own = self.bases(x)[setup]
         return Placement(own[:3], own[3])
 
     def base_values(self, setup: int, wanted: Placement) -> Floats:
-        """Return the base parameters (6,) with which the base stands as wanted at a set-up: the inverse of `base`."""
+        """Return the base parameters (6,) for a wanted placement of the base at a set-up: the inverse of `base`."""
         r = wanted.rotation @ self._rotations[setup].T
         pitch = -math.asin(min(1.0, max(-1.0, float(r[2, 0]))))
         angles = math.atan2(r[1, 0], r[0, 0]), pitch, math.atan2(r[2, 1], r[2, 2])
@@ -377,7 +377,7 @@ class Chain:
         return self._evaluate(x, data, len(data))
 
     def _evaluate(self, x: Floats, data: ChainData, derived: int) -> Linearisation:
-        """Compute the positions of all rows, and derivatives where `derived` is their number and not 0."""
+        """Compute the positions of all rows, and derivatives if `derived` is the number of rows and not 0."""
         out = Linearisation(
             np.empty((len(data), 3)),
             np.zeros((derived, 3, len(self))),
@@ -390,11 +390,11 @@ class Chain:
         return out
 
     def tables(self, x: Floats) -> tuple[Transforms, Points]:
-        """Return the rows and the prisms at parameters (p,), as the compiled loops take them."""
+        """Return the tables of rows and prisms at parameters (p,), for the compiled loops."""
         return self._tree.at(np.require(x, np.float64, PLAIN))
 
     def bases(self, x: Floats) -> Floats:
-        """Return (setups, 7, 3): rotation, origin, and the lines about which rz, ry and rx turn, of every base."""
+        """Return (setups, 7, 3): rotation, origin, and the axes about which rz, ry and rx turn, of every base."""
         out = np.empty((len(self.setups), 7, 3))
         chain_loops.place_bases(
             np.require(x, np.float64, PLAIN), self._rotations, self._translations_mm, self.base_start, out
@@ -413,7 +413,7 @@ def rotation_about(axis: int, angle_rad: float) -> Floats:
 
 
 def _starts(lists: Iterable[Sized]) -> Integers:
-    """Return where each of several lists begins when they are put one after the other, and where the last ends."""
+    """Return the first index of each list in their concatenation, and the end of the last one."""
     return np.array(list(accumulate(map(len, lists), initial=0)), dtype=np.intp)
 
 

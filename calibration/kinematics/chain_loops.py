@@ -1,9 +1,10 @@
-"""Forward kinematics and derivatives, compiled: one walk over the rows of a rig, and the steps that follow from it.
+"""Compiled forward kinematics and derivatives: one walk over the rows of a rig, and steps that use its results.
 
 An elementary transform with axis u through origin o moves a point P beyond it by u x (P - o) per rad of a rotation and
-by u per mm of a translation. So the walk keeps axis and origin of every transform, and every derivative follows.
+by u per mm of a translation. So the walk keeps axis and origin of every transform, from which all derivatives follow.
 
-All that is compiled together is in this file: numba keeps a function's machine code as long as its own file stays.
+Functions that are compiled together are all in this file, as numba caches machine code until a function's own file
+changes.
 """
 
 from __future__ import annotations
@@ -24,11 +25,12 @@ class Transforms(NamedTuple):
     """The elementary transforms of all rows, one after the other.
 
     Attributes:
-        kind: (k, 3) 1 for a rotation, else 0; its axis; its parameter (-1: none).
-        amount: (k, 3) its constant part in rad or mm, and cosine and sine of that.
-        drive_start, drive_joint, drive_size: the drives of transform k are drive_start[k] .. drive_start[k + 1].
-        row_start: the transforms of row i are row_start[i] .. row_start[i + 1].
-        frame_before: (rows,) the frame that each continues from, 0 for the base.
+        kind: (k, 3) 1 for a rotation, else 0; axis; index of the parameter (-1: none).
+        amount: (k, 3) constant part in rad or mm, and its cosine and sine.
+        drive_start, drive_joint, drive_size: transform k has the drives from drive_start[k] to drive_start[k + 1] - 1,
+            each with the index of its joint and its coefficient.
+        row_start: row i has the transforms from row_start[i] to row_start[i + 1] - 1.
+        frame_before: (rows,) frame at which each row starts, 0 for the base.
     """
 
     kind: Integers
@@ -44,9 +46,9 @@ class Points(NamedTuple):
     """Points fixed to frames.
 
     Attributes:
-        frame: (m,) of each.
-        offset: (m, 3) of each in its frame, mm.
-        parameter: (m,) index of the first of the three parameters of its offset.
+        frame: (m,) frame of each point.
+        offset: (m, 3) offset of each point in its frame, mm.
+        parameter: (m,) index of the first of the three parameters of the offset.
         path_start, path: the transforms that move point i are path[path_start[i] : path_start[i + 1]].
     """
 
@@ -69,8 +71,8 @@ def settle(x: Floats, kind: Integers, constant: Floats, amount: Floats) -> None:
 def place_bases(x: Floats, rotation: Floats, translation: Floats, first: int, bases: Floats) -> None:
     """Fill `bases` (setups, 7, 3): Trans(x, y, z) Rot(z) Rot(y) Rot(x) times every placement.
 
-    The first three are the rotation, the fourth is the origin, the last three are the lines through it about which rz,
-    ry and rx turn. The parameters of the bases are those of `x` (p,) from `first` on.
+    The first three vectors are the rotation, the fourth is the origin, and the last three are the axes through it about
+    which rz, ry and rx turn. The parameters of the bases are those of `x` (p,) from index `first` on.
     """
     for b in range(len(rotation)):
         at, base = first + 6 * b, bases[b]
@@ -90,7 +92,7 @@ def place_bases(x: Floats, rotation: Floats, translation: Floats, first: int, ba
 
 @inlined
 def start_at_station(base: Floats, ends: Floats, frames: Floats) -> None:
-    """Start a walk where the base (7, 3) stands: everything is then in the station's frame."""
+    """Start a walk at the base (7, 3), so that its results are in the station's frame."""
     for i in range(3):
         frames[0, i] = base[3, i]
         for j in range(3):
@@ -101,10 +103,10 @@ def start_at_station(base: Floats, ends: Floats, frames: Floats) -> None:
 def walk(
     readings: Floats, first: int, last: int, transforms: Transforms, ends: Floats, kept: Floats, frames: Floats
 ) -> None:
-    """Walk the rows first .. last of one pose, from a start that is set.
+    """Walk the rows from `first` to `last` - 1 of one pose, from a start that is already set.
 
-    `ends` (rows + 1, 3, 3) gets the axes (as rows) after each row, and `frames` (rows + 1, 3) the origins; `kept`
-    (transforms, 6) the axis and the origin that each transform acts at.
+    `ends` (rows + 1, 3, 3) receives the axes (as rows) after each row, and `frames` (rows + 1, 3) the origins. `kept`
+    (transforms, 6) receives the axis and the origin of each transform.
     """
     kind, amount, drive_start, drive_joint, drive_size, row_start, frame_before = transforms
     for row in range(first, last):
@@ -145,7 +147,7 @@ def walk_from_base(readings: Floats, transforms: Transforms, ends: Floats, kept:
 
 @inlined
 def place_point(offset: Floats, frame: Floats, origin: Floats, out: Floats) -> None:
-    """Fill `out` (3,) with the place of a point fixed to a frame (3, 3; axes as rows)."""
+    """Fill `out` (3,) with the position of a point fixed to a frame (3, 3; axes as rows)."""
     for j in range(3):
         out[j] = origin[j] + offset[0] * frame[0, j] + offset[1] * frame[1, j] + offset[2] * frame[2, j]
 
@@ -193,7 +195,7 @@ def by_transforms(
 
 @inlined
 def by_offset(axes: Floats, first: int, out: Floats) -> None:
-    """Fill columns first .. first + 3 of `out` (3, q) with the axes (as rows) of the frame that a point is fixed to."""
+    """Fill three columns of `out` (3, q), from `first` on, with the axes (as rows) of the frame of a point."""
     for i in range(3):
         for j in range(3):
             out[j, first + i] = axes[i, j]
@@ -201,9 +203,9 @@ def by_offset(axes: Floats, first: int, out: Floats) -> None:
 
 @inlined
 def by_base(arm: Floats, base: Floats, first: int, out: Floats) -> None:
-    """Fill columns first .. first + 6 of `out` (3, q), zero at first, with the derivatives by the base's parameters.
+    """Fill six columns of `out` (3, q), from `first` on and initially zero, with derivatives by the base's parameters.
 
-    All is in the station's frame; `arm` (3,) is from the base's origin to the point.
+    All are in the station's frame; `arm` (3,) is the vector from the base's origin to the point.
     """
     for i in range(3):
         a0, a1, a2 = base[4 + i, 0], base[4 + i, 1], base[4 + i, 2]
@@ -215,7 +217,7 @@ def by_base(arm: Floats, base: Floats, first: int, out: Floats) -> None:
 
 @inlined
 def turn_back(base: Floats, first: int, out: Floats) -> None:
-    """Turn columns first .. first + 6 of `out` (3, q) from the station's frame into the base frame."""
+    """Turn six columns of `out` (3, q), from `first` on, from the station's frame into the base frame."""
     for i in range(first, first + 6):
         m0, m1, m2 = out[0, i], out[1, i], out[2, i]
         for j in range(3):
@@ -227,11 +229,11 @@ def by_coefficients(column: Floats, shift: Floats, joint: Integers, by_joint: Fl
     """Fill the last columns of `out` (3, q) with the derivatives of a point by coefficients of effects.
 
     Args:
-        column: (k,) change of its joint per unit of each coefficient.
-        shift: (3, k) displacement of the point beside that; no columns where no coefficient has one.
-        joint: (k,) of each, -1 for none.
+        column: (k,) change of the joint per unit of each coefficient.
+        shift: (3, k) additional displacement of the point per unit; no columns if no coefficient has one.
+        joint: (k,) joint of each coefficient, -1 for none.
         by_joint: (3, joints) derivatives by the readings.
-        out: filled.
+        out: (3, q) derivatives, to be filled.
     """
     first = out.shape[1] - len(column)
     for c in range(len(column)):
@@ -266,11 +268,11 @@ def linearise(
     jacobian: Floats,
     by_joint: Floats,
 ) -> None:
-    """Fill `position` (n, 3) in the station's frame, and the Jacobians, zero at first, where they have rows.
+    """Fill `position` (n, 3) in the station's frame, and the initially zero Jacobians if they have rows.
 
-    The tables of `Transforms` and `Points` come one by one: as tuples they would cost a caller of few rows a
-    microsecond each. `bases` (setups, 7, 3) are as `place_bases` fills them, their parameters from `base_start` on;
-    `jacobian` is (n, 3, p) and `by_joint` (n, 3, joints).
+    The fields of `Transforms` and `Points` are separate arguments, because passing each tuple would cost a microsecond,
+    which matters for few rows. `bases` (setups, 7, 3) are from `place_bases`, with their parameters from `base_start`
+    on. `jacobian` is (n, 3, p) and `by_joint` (n, 3, joints).
     """
     transforms = Transforms(kind, amount, drive_start, drive_joint, drive_size, row_start, frame_before)
     points = Points(frame, offset, parameter, path_start, path)
@@ -309,8 +311,8 @@ def work(
 ) -> None:
     """Fill `out` (n, joints) with the work of forces (n, points) along `direction` (n, 3), per unit of each reading.
 
-    Forces and directions that are the same in all rows are one.
-    From the last row back to the base, each transform moves all the points beyond it: their sum and moment suffice.
+    Forces and directions that are equal in all rows may have a single row. The loop runs from the last row back to the
+    base. Each transform moves all points beyond it, so the sum and the moment of their forces are sufficient.
     """
     rows = len(frame_before)
     ends, kept, frames = np.empty((rows + 1, 3, 3)), np.empty((len(kind), 6)), np.empty((rows + 1, 3))
@@ -353,7 +355,7 @@ def places(
     offset: Floats,
     out: Floats,
 ) -> None:
-    """Fill `out` (n, points, 3) with the places of points fixed to frames, in the base frame."""
+    """Fill `out` (n, points, 3) with the positions of points fixed to frames, in the base frame."""
     rows = len(transforms.frame_before)
     ends, kept, frames = np.empty((rows + 1, 3, 3)), np.empty((len(transforms.kind), 6)), np.empty((rows + 1, 3))
     for n in range(len(readings)):

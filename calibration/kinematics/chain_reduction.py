@@ -1,10 +1,10 @@
 """Reduction of a chain, for each candidate of a population, to one step for each driven rotation.
 
-Between two driven rotations, which always turn about z, a chain is one rigid transform that only the candidate
-decides. Every rigid transform is Rz(alpha) Rx(beta) Trans(a, b, d) Rz(gamma), and what is about or along z commutes
-with the driven rotations beside it: alpha joins the rotation before it, gamma the one after it, d moves on towards the
-prism. So a candidate leaves one step for each driven rotation, p <- Rx(beta) (Rz(angle) p + (a, b, 0)), which costs
-eight multiplications with additions for each observation. Many candidates are reduced at a time, in float64.
+Between two driven rotations, which always turn about z, a chain is one rigid transform that depends only on the
+candidate. Every rigid transform is Rz(alpha) Rx(beta) Trans(a, b, d) Rz(gamma). Its parts about or along z commute with
+the adjacent driven rotations: alpha is added to the rotation before it, gamma to the one after it, and d is moved on
+towards the prism. So a candidate needs one step for each driven rotation, p <- Rx(beta) (Rz(angle) p + (a, b, 0)), with
+eight multiply-adds for each observation. Many candidates are reduced at a time, in float64.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from calibration.observations import Floats
 Integers = NDArray[np.intp]
 
 BLOCK = 64  # candidates that are reduced together
-ROTATE, SHIFT, FIXED, SLIDE = 0, 1, 2, 3  # how an instruction changes a segment's frame
+ROTATE, SHIFT, FIXED, SLIDE = 0, 1, 2, 3  # codes of instructions that change a segment's frame
 
 # Cody and Waite's pi/2 in three parts, and the polynomials of fdlibm's __kernel_sin and __kernel_cos.
 _ROUND = 1.5 * 2.0**52
@@ -32,16 +32,16 @@ _C1, _C2, _C3 = 4.16666666666666019037e-02, -1.38888888888741095749e-03, 2.48015
 _C4, _C5, _C6 = -2.75573143513906633035e-07, 2.08757232129817482790e-09, -1.13596475577881948265e-11
 
 
-class Tree(NamedTuple):
-    """The constant parts of a chain, as candidates are reduced by them.
+class SegmentTree(NamedTuple):
+    """The constant parts of a chain, with which candidates are reduced.
 
     A *segment* is the run of constant transforms before a driven rotation (a joint segment) or before a prism (an end
-    segment); a *slide* is a length that readings drive inside a segment.
+    segment). A *slide* is a driven length inside a segment.
 
     Attributes:
         angle, angle_parameter: (angles) constant and searched parameter of each distinct angle.
-        shift, shift_parameter: (shifts) the same of each distinct length.
-        fixed: (f, 3, 4) rigid transforms that nothing searched changes.
+        shift, shift_parameter: (shifts) constant and searched parameter of each distinct length.
+        fixed: (f, 3, 4) rigid transforms without searched parameters.
         instruction: (i, 3) code, axis, and the index of the angle, length, rigid transform or slide.
         segment: (s, 4) number of instructions, segment before it (-1 for none), 1 for an end segment, first slide;
             parents come before their children.
@@ -56,9 +56,9 @@ class Tree(NamedTuple):
     segment: Integers
 
 
-@part("contract")  # its accuracy is the order of its operations
+@part("contract")  # its accuracy depends on the order of its operations
 def _cosines_sines(angle: Floats, cosine: Floats, sine: Floats) -> None:
-    """Fill cosines and sines of `BLOCK` angles, right to the last bit or two; NaN beyond 1e9 rad."""
+    """Fill cosines and sines of `BLOCK` angles, accurate to the last bit or two; NaN beyond 1e9 rad."""
     for j in range(BLOCK):
         quarter = (angle[j] * (2.0 / math.pi) + _ROUND) - _ROUND
         quarter = quarter if abs(quarter) < 1e9 else math.nan
@@ -66,7 +66,7 @@ def _cosines_sines(angle: Floats, cosine: Floats, sine: Floats) -> None:
         z = r * r
         s = r + r * z * (_S1 + z * (_S2 + z * (_S3 + z * (_S4 + z * (_S5 + z * _S6)))))
         c = 1.0 - (0.5 * z - z * z * (_C1 + z * (_C2 + z * (_C3 + z * (_C4 + z * (_C5 + z * _C6))))))
-        # An odd quadrant exchanges the two, the second half of the circle turns the sign of both.
+        # An odd quadrant exchanges the two; the second half of the circle changes the sign of both.
         half = ((quarter * 0.5 - 0.25) + _ROUND) - _ROUND
         whole = ((half * 0.5 - 0.25) + _ROUND) - _ROUND
         odd = quarter - 2.0 * half
@@ -111,7 +111,7 @@ def _shift(state: Floats, axis: int, size: Floats) -> None:
 
 @part()
 def _begin(state: Floats, constants: Floats, parent: int, is_end: bool) -> None:
-    """Set the frames at the start of a segment: d of its parent; an end segment also has the parent's gamma."""
+    """Set the frames at the start of a segment: shifted by d of its parent, and turned by gamma for an end segment."""
     cg, sg, d = constants[parent, 6], constants[parent, 7], constants[parent, 8]
     for i in range(12):
         row = state[i]
@@ -127,16 +127,16 @@ def _begin(state: Floats, constants: Floats, parent: int, is_end: bool) -> None:
 
 @part()
 def _decompose(cell: Floats) -> None:
-    """Split the frames into Rz(alpha) Rx(beta) Trans(a, b, d) Rz(gamma); alpha takes the parent's gamma up.
+    """Split the frames into Rz(alpha) Rx(beta) Trans(a, b, d) Rz(gamma), and add the parent's gamma to alpha.
 
-    `cell` is the state in one row, so that the compiler sees that nothing overlaps: the frames' twelve rows, cosine and
-    sine of the parent's gamma; then the nine results and cosine and sine of alpha alone.
+    `cell` is the state as one row, so that the compiler knows that nothing overlaps: the frames' twelve rows, cosine
+    and sine of the parent's gamma, then the nine results, and cosine and sine of alpha without the parent's gamma.
     """
     B = BLOCK
     for j in range(B):
         square = cell[2 * B + j] * cell[2 * B + j] + cell[5 * B + j] * cell[5 * B + j]
         cb, sb = cell[8 * B + j], math.sqrt(square)
-        parallel = square < 1e-28  # alpha is then anything, so zero
+        parallel = square < 1e-28  # alpha is then arbitrary, so it is set to zero
         inverse = 1.0 / (1.0 if parallel else sb)
         ca = 1.0 if parallel else -cell[5 * B + j] * inverse
         sa = 0.0 if parallel else cell[2 * B + j] * inverse
@@ -166,7 +166,7 @@ def _begin_slide(state: Floats, axis: int, slide: Floats) -> None:
 
 @part()
 def _turn_slide(state: Floats, slide: Floats) -> None:
-    """Turn a direction by -alpha, as `_decompose` leaves it."""
+    """Turn a direction by -alpha, with the cosine and sine from `_decompose`."""
     for j in range(BLOCK):
         x, y, ca, sa = slide[0, j], slide[1, j], state[23, j], state[24, j]
         slide[0, j] = ca * x + sa * y
@@ -174,10 +174,12 @@ def _turn_slide(state: Floats, slide: Floats) -> None:
 
 
 @part()
-def _segments(tree: Tree, angles: Floats, shift: Floats, state: Floats, constants: Floats, slides: Floats) -> None:
+def _segments(
+    tree: SegmentTree, angles: Floats, shift: Floats, state: Floats, constants: Floats, slides: Floats
+) -> None:
     """Fill the constants and slides of one block; see `reduce_chain`."""
     for j in range(BLOCK):
-        constants[len(tree.segment), 6, j] = 1.0  # a parent of -1 is this last row: before the base nothing turns
+        constants[len(tree.segment), 6, j] = 1.0  # parent -1 is this last row, as there is no rotation before the base
     number = 0
     for segment in range(len(tree.segment)):
         parent, is_end, first_slide = tree.segment[segment, 1], tree.segment[segment, 2] == 1, tree.segment[segment, 3]
@@ -209,7 +211,7 @@ def _segments(tree: Tree, angles: Floats, shift: Floats, state: Floats, constant
 
 
 @compiled
-def reduce_chain(tree: Tree, population: Floats) -> tuple[Floats, Floats]:
+def reduce_chain(tree: SegmentTree, population: Floats) -> tuple[Floats, Floats]:
     """Reduce the chain for candidates.
 
     Args:
@@ -217,9 +219,9 @@ def reduce_chain(tree: Tree, population: Floats) -> tuple[Floats, Floats]:
         population: (candidates, p) searched parameters.
 
     Returns:
-        (blocks, segments + 1, 9, BLOCK) constants. Of a joint segment: cosine and sine of alpha, of beta, a, b, cosine
-        and sine of gamma, d. Of an end segment: the prism's x, y, z in 4, 5 and 8. The last candidate fills its block.
-        (blocks, slides, 3, BLOCK) directions of the slides.
+        (blocks, segments + 1, 9, BLOCK) constants, and (blocks, slides, 3, BLOCK) directions of the slides. The
+        constants of a joint segment are cosine and sine of alpha and of beta, a, b, cosine and sine of gamma, and d.
+        Those of an end segment are the prism's x, y, z at 4, 5 and 8. Copies of the last candidate fill up its block.
     """
     segments, blocks = len(tree.segment), -(-len(population) // BLOCK)
     slide_count = 0

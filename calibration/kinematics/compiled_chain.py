@@ -1,6 +1,6 @@
-"""A chain at parameters that stay: positions of its prisms and frames, derivatives, and the uncertainty of a fix.
+"""A chain with fixed parameters: positions of its prisms and frames, derivatives, and the uncertainty of a fix.
 
-The covariances of fixes are those that `calibration.identification.samples` computes for a fit.
+The covariances of fixes are the same as in `calibration.identification.samples`.
 """
 
 from __future__ import annotations
@@ -23,11 +23,12 @@ class Located(NamedTuple):
     """Positions of prisms and frames in n rows.
 
     Attributes:
-        position_mm: (n, 3) in the station's frame.
-        prism_mm: (n, 3) in the base frame.
+        position_mm: (n, 3) prisms in the station's frame.
+        prism_mm: (n, 3) prisms in the base frame.
         frames_mm: (n, rows + 1, 3) origins of the base frame and of the frame after each row, in the base frame.
-        joint_jacobian: (n, 3, joints) by reading, mm per deg or mm, in the base frame.
-        jacobian: (n, 3, p + k) by parameter and coefficient, mm per unit, in the base frame; no rows if not wanted.
+        joint_jacobian: (n, 3, joints) derivatives by readings in the base frame, mm per deg or mm.
+        jacobian: (n, 3, p + k) derivatives by parameters and coefficients in the base frame, mm per unit; no rows if
+            not requested.
     """
 
     position_mm: Floats
@@ -38,11 +39,12 @@ class Located(NamedTuple):
 
 
 class Facing(NamedTuple):
-    """Orientation of prisms and their displacement by each drive of a row, n rows; all in the base frame.
+    """Orientation of prisms and their displacement by each drive, in n rows; all in the base frame.
 
     Attributes:
-        axes: (n, 3, 3) of the prism's frame, as rows.
-        by_drive: (n, 3, drives) mm per deg or mm of the reading, through one drive of `CompiledChain.drives` alone.
+        axes: (n, 3, 3) axes of the prism's frame, as rows.
+        by_drive: (n, 3, drives) derivatives through each drive of `CompiledChain.drives` alone, mm per deg or mm of
+            the reading.
     """
 
     axes: Floats
@@ -50,18 +52,18 @@ class Facing(NamedTuple):
 
 
 class CompiledChain:
-    """A chain at parameters that stay; build it once and ask for any rows.
+    """A chain with fixed parameters; build it once and evaluate any rows.
 
     Args:
         chain: kinematics.
-        x: (p,) its parameters.
-        covariance: (p + k, p + k) of them and of coefficients of effects; by default all is certain.
-        coefficient_joint: (k,) the joint whose value each coefficient changes, -1 for none.
-        repeat_sigma_mm: scatter of repeated fixes beyond the station's own sigma, each axis.
+        x: (p,) parameters of the chain.
+        covariance: (p + k, p + k) covariance of the parameters and of coefficients of effects; zero by default.
+        coefficient_joint: (k,) joint whose value each coefficient changes, -1 for none.
+        repeat_sigma_mm: scatter of repeated fixes in excess of the station's sigma, per axis.
 
     Attributes:
-        bases: (setups, 7, 3) as `chain_loops.place_bases` fills them.
-        drives: (row number from 1, index of the joint) of everything that drives a row; a coupled joint has several.
+        bases: (setups, 7, 3) bases from `chain_loops.place_bases`.
+        drives: (row number from 1, index of the joint) of every drive; a coupled joint has several.
     """
 
     def __init__(
@@ -116,9 +118,9 @@ class CompiledChain:
         """Return the positions of n rows with the Jacobian by parameters and coefficients.
 
         Args:
-            data: n rows, with the joints where the effects have them.
-            column: (n, k) deg or mm of its joint per unit of each coefficient; may be left out where there are none.
-            shift_mm: (n, 3, k) displacement in the base frame per unit of each coefficient, on top of that.
+            data: n rows, with readings as corrected by the effects.
+            column: (n, k) change of the joint per unit of each coefficient, deg or mm; not needed without coefficients.
+            shift_mm: (n, 3, k) additional displacement in the base frame per unit of each coefficient.
         """
         column = np.empty((len(data), 0)) if column is None else column
         return self.spread(data, column, shift_mm, _NOTHING, _NOTHING, _NOTHING, jacobian=True)[0]
@@ -140,14 +142,14 @@ class CompiledChain:
             data: as for `linearise`.
             column: as for `linearise`.
             shift_mm: as for `linearise`.
-            sigma_mm: (n, 3) of the fix, in place of the station's where given.
+            sigma_mm: (n, 3) standard deviations of the fix, which replace the station's where finite.
             rates: (n, joints) deg/s or mm/s, NaN where not measured.
-            variance: (n, joints) of each joint's value, deg^2 or mm^2.
-            jacobian: True if the one by parameters is wanted.
+            variance: (n, joints) variance of each joint's value, deg^2 or mm^2.
+            jacobian: whether to return the Jacobian by parameters and coefficients.
 
         Returns:
-            The positions; (n, 3, 3) covariance of the fix (station, repeats, readings, instant) and (n, 3, 3) that by
-            parameters and coefficients, mm^2, both in the station's frame.
+            The positions; the covariance (n, 3, 3) of the fix due to station, repeats, readings and timing; and the
+            covariance (n, 3, 3) due to parameters and coefficients. Both are in mm^2, in the station's frame.
         """
         n, m = len(data), len(variance)
         out = Located(

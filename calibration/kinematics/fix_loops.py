@@ -1,4 +1,4 @@
-"""Positions of prisms with the uncertainty of a fix, compiled: the loops behind `CompiledChain`."""
+"""Compiled loops of `CompiledChain`: positions of prisms with the uncertainty of a fix."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def _of_parameters(jacobian: Floats, root: Floats, scaled: Floats, out: Floats) 
 
 @compiled
 def _of_readings(rates: Floats, variance: Floats, instant_s: float, by_joint: Floats, out: Floats) -> None:
-    """Fill the lower triangle of `out` (3, 3) with what errors of the readings and of their instant do."""
+    """Fill the lower triangle of `out` (3, 3) with the covariance due to errors of the readings and of their timing."""
     out[:] = 0.0
     v0, v1, v2 = 0.0, 0.0, 0.0
     for joint in range(len(variance)):
@@ -85,7 +85,7 @@ def _of_readings(rates: Floats, variance: Floats, instant_s: float, by_joint: Fl
 
 @compiled
 def _add_station(p: Floats, sigma_mm: Floats, station: Station, out: Floats) -> None:
-    """Add the covariance of a fix at `p` to `out` (3, 3): the station's, or the fix's own, and that of repeats."""
+    """Add the covariance of a fix at `p`, due to station (or the fix's own sigma) and repeats, to `out` (3, 3)."""
     distance_mm, distance_ppm, circles_rad, centring_mm, repeats_mm, _ = station
     range_mm = max(math.sqrt(p[0] * p[0] + p[1] * p[1] + p[2] * p[2]), 1e-6)
     radial = (distance_mm + distance_ppm * 1e-6 * range_mm) ** 2
@@ -133,13 +133,13 @@ def locate(
     of_fix: Floats,
     of_parameters: Floats,
 ) -> None:
-    """Fill the arrays of a `Located`; `by_parameter` and both covariances only where they have rows.
+    """Fill the arrays of a `Located`; `by_parameter` and both covariances only if they have rows.
 
-    The first arguments are as for `chain_loops.linearise`. `root` (q, q) is lower triangular: root @ root' is the
-    covariance of parameters and coefficients of effects, of which the coefficients come last; `coefficient_joint` (k,)
-    is the joint that each of these changes, -1 for none. `station` has distance in mm and ppm, circles in rad, centring
-    in mm, repeats in mm and instant in s, 1 sigma each. The others are as for `CompiledChain.spread`, and the arrays to
-    fill, of which both Jacobians are zero at first.
+    The first arguments are as for `chain_loops.linearise`. `root` (q, q) is lower triangular; root @ root' is the
+    covariance of parameters and then coefficients of effects. `coefficient_joint` (k,) is the joint that each
+    coefficient changes, -1 for none. `station` holds the sigmas of distance in mm and ppm, circles in rad, centring in
+    mm, repeats in mm and timing in s. The following arguments are as for `CompiledChain.spread`. The last are the
+    arrays to fill, of which both Jacobians must be zero initially.
     """
     transforms = Transforms(kind, amount, drive_start, drive_joint, drive_size, row_start, frame_before)
     points = Points(frame, offset, parameter, path_start, path)
@@ -188,26 +188,26 @@ def add_learned(
     position: Floats,
     sigma: Floats,
 ) -> bool:
-    """Fill positions with a residual learner's correction, and the standard deviation of a fix about them.
+    """Fill positions corrected by a residual learner, and the standard deviation of a fix about them.
 
     Args:
         setup: (n,) set-up of each row.
-        bases: (setups, 7, 3) as `CompiledChain` has them.
+        bases: (setups, 7, 3) bases of `CompiledChain`.
         before: (n, 3) positions without the learner, mm.
-        estimate: (n, 3) its correction in the base frame, mm.
-        weight: (n,) of the correction, 0 to 1.
-        of_fix: (n, 3, 3) as from `CompiledChain.spread`.
-        of_parameters: (n, 3, 3) as from `CompiledChain.spread`.
-        of_base: (n, 3) the variance by parameters that no learner reduces, mm^2.
-        made_good: share of the rest that a learner of weight 1 removes.
-        excess: (2, 3) variance in mm^2 that the model lacks along the base frame's axes, without a learner and with it.
-        position: (n, 3) mm in the station's frame, filled.
-        sigma: (n, 3) mm in the station's frame, filled.
+        estimate: (n, 3) correction by the learner in the base frame, mm.
+        weight: (n,) weight of the correction, 0 to 1.
+        of_fix: (n, 3, 3) covariance from `CompiledChain.spread`.
+        of_parameters: (n, 3, 3) covariance from `CompiledChain.spread`.
+        of_base: (n, 3) variance due to parameters that no learner reduces, mm^2.
+        made_good: share of the remaining variance due to parameters that a learner of weight 1 removes.
+        excess: (2, 3) excess variance along the base frame's axes, without and with a learner, mm^2.
+        position: (n, 3) positions in the station's frame, mm, to be filled.
+        sigma: (n, 3) standard deviations in the station's frame, mm, to be filled.
 
     Returns:
-        True if all of them are finite.
+        True if all positions and standard deviations are finite.
     """
-    total = 0.0  # hides neither infinity nor NaN
+    total = 0.0  # shows both infinity and NaN
     for n in range(len(setup)):
         base, counts = bases[setup[n]], weight[n]
         for i in range(3):

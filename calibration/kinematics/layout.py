@@ -1,7 +1,7 @@
-"""The segments of a chain and the order of its observations, as the compiled fitness takes them.
+"""Segments of a chain and order of its observations for the compiled fitness.
 
-The transforms of all prisms form a tree with shared beginnings. Observations of several prisms from one pose are worked
-on together.
+The transforms of all prisms form a tree with shared beginnings. Observations of several prisms in one pose are
+processed together.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.kinematics.chain import Chain, ChainData, Op, X, Y, Z, rotation_about
-from calibration.kinematics.chain_reduction import FIXED, ROTATE, SHIFT, SLIDE, Integers, Tree
+from calibration.kinematics.chain_reduction import FIXED, ROTATE, SHIFT, SLIDE, Integers, SegmentTree
 from calibration.kinematics.population_loops import (
     ADD_ANGLE,
     CHUNK,
@@ -33,17 +33,17 @@ from calibration.observations import Floats
 
 
 class Layout(NamedTuple):
-    """Observations in chunks, and the steps that are taken for each.
+    """Observations in chunks, and the steps to take for each.
 
     Attributes:
-        todo: (w, 6) steps: code and operands as the compiled function takes them; a run of them belongs to a group.
+        todo: (w, 6) code and operands of each step of the compiled function; the steps of a group are consecutive.
         chunk: (c, 4) first and last + 1 entry of `todo`, number of poses (a multiple of `LANES`), first prism slot.
         table: (c * 2 rotations * CHUNK) cosines and sines of the driven angles.
         length: (c * lengths * CHUNK) driven lengths, mm.
         target: (slots * 4 * CHUNK) measured x, y, z relative to the set-up's nominal base, mm, and weight; one slot for
             each prism of a chunk; padded poses have weight 0.
-        place: (n) where the x of each observation is in `target`.
-        turns, lengths: how many driven angles and driven lengths the readings make.
+        place: (n) index of the x of each observation in `target`.
+        turns, lengths: numbers of distinct driven angles and driven lengths.
     """
 
     todo: Integers
@@ -94,12 +94,12 @@ class _Segment:
 
 
 class Planner:
-    """Collects the segments of the paths from the base to the prisms, then orders the observations by them.
+    """Collects the segments of the paths from the base to the prisms, then orders the observations accordingly.
 
     Args:
         chain: kinematics.
         free: (p,) mask of the parameters that are searched.
-        at: (p,) values of the others.
+        at: (p,) values of the other parameters.
     """
 
     def __init__(self, chain: Chain, free: NDArray[np.bool_], at: Floats) -> None:
@@ -131,13 +131,13 @@ class Planner:
         return path[::-1]
 
     def _settled(self, op: Op) -> Op:
-        """Return the transform with the value of a parameter that is not searched in its constant."""
+        """Return the transform with the value of its parameter added to the constant if it is not searched."""
         if op.parameter < 0:
             return op
         constant = op.constant + float(self._at[op.parameter])
         return replace(op, constant=constant, parameter=int(self._searched[op.parameter]))
 
-    # Driven rotations are about z in every convention of the rig description, as the collapsed steps need it.
+    # Driven rotations are about z in every convention of the rig description, as the reduced steps require.
     def _segment(self, path: list[int], setup: int, run: list[Op], base: int) -> int:
         """Return the number of the segment of `run` that follows `path`; the first `base` transforms are the base's."""
         parent = path[-1] if path else -1
@@ -167,14 +167,14 @@ class Planner:
         return self._number[key]
 
     def _flush(self, segment: _Segment, gathered: Floats) -> Floats:
-        """Append the constant transforms gathered so far, and return the identity to gather on."""
+        """Append the constant transforms gathered so far, and return the identity to gather the next."""
         if not np.array_equal(gathered, np.eye(4)):
             segment.instruction.append((FIXED, 0, len(self._fixed)))
             self._fixed.append(gathered[:3])
         return np.eye(4)
 
     def _todo(self, setup: int, prisms: Sequence[int]) -> list[tuple[int, ...]]:
-        """Return the steps for the poses of a group: driven angles for all prisms, then one prism after the other."""
+        """Return the steps for the poses of a group: driven angles for all prisms, then each prism in turn."""
         todo: list[tuple[int, ...]] = []
         paths = [self._path(setup, prism) for prism in prisms]
         turned = sorted({segment for path in paths for segment in path[1:-1]})
@@ -201,7 +201,7 @@ class Planner:
         return [(*entry, *(0,) * (6 - len(entry))) for entry in todo]
 
     def _first(self, end: int, segment: int) -> list[tuple[int, ...]]:
-        """Return the steps from a prism's place to the coordinates after the driven rotation nearest to it."""
+        """Return the steps from a prism's position to the coordinates after the driven rotation nearest to it."""
         turn = self._segments[segment].turn
         moves = self._moves(end)
         if not moves:
@@ -219,8 +219,8 @@ class Planner:
     def _first_slide(self, segment: int) -> int:
         return sum(len(s.slides) for s in self._segments[:segment])
 
-    def plan(self, data: ChainData, position_mm: Floats, weight: Floats) -> tuple[Tree, Layout]:
-        """Order the observations, so that prisms that are seen from one pose share its turned angles.
+    def plan(self, data: ChainData, position_mm: Floats, weight: Floats) -> tuple[SegmentTree, Layout]:
+        """Order the observations so that prisms measured in one pose share its driven angles.
 
         Args:
             data: (n) bound observations.
@@ -242,7 +242,7 @@ class Planner:
                 chunks.append((first, len(todo), -(-len(piece) // LANES) * LANES, slots))
                 rows_of.append(piece)
                 slots += len(prisms)
-        tree = Tree(
+        tree = SegmentTree(
             *self._angles.pairs(),
             *self._shifts.pairs(),
             np.array(self._fixed).reshape(-1, 3, 4),
@@ -290,10 +290,10 @@ class Planner:
 
 
 def _groups(data: ChainData) -> Iterator[tuple[int, list[int], Integers]]:
-    """Group poses where the same prisms are seen at the same set-up: (set-up, its k prisms, (poses, k) rows of `data`).
+    """Yield groups of poses with the same prisms at one set-up: (set-up, its k prisms, (poses, k) rows of `data`).
 
-    Observations with exactly the same readings at the same set-up are one pose; a prism that is seen there once more
-    makes another one.
+    Observations with exactly the same readings at the same set-up are one pose. Repeated measurements of a prism there
+    form additional poses.
     """
     n = len(data)
     if n == 0:

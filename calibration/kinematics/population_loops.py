@@ -1,8 +1,8 @@
-"""The loops over observations that every candidate of a population goes through.
+"""Compiled loops over observations for every candidate of a population.
 
-From a prism back to the base, one loop or half a loop for each driven rotation. The coordinates of a chunk stay in the
-first-level cache; sines and cosines of the readings are computed once for all candidates, and a candidate's own angles
-enter by angle addition, once for all prisms of a pose.
+From a prism back to the base there is one loop, or half of one, for each driven rotation. The coordinates of a chunk
+stay in the first-level cache. Sines and cosines of the readings are computed once for all candidates, and the angles of
+a candidate are added by the angle addition formulas, once for all prisms of a pose.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ from calibration.kinematics.chain_reduction import BLOCK, Integers
 from calibration.numerics.jit import compiled, part
 from calibration.observations import Floats
 
-Working = NDArray[np.floating[Any]]  # float64 or float32, the precision of the work
+Working = NDArray[np.floating[Any]]  # float64 or float32, the precision of the loops
 
-CHUNK = 256  # poses that are worked on at a time
-TILE = 8  # candidates that go through a chunk one after the other, so that its readings are fetched once for all
-LANES = 16  # the number of poses in a chunk is a multiple of this: whole vector registers, no remainders
+CHUNK = 256  # poses that are processed at a time
+TILE = 8  # candidates that process a chunk one after the other, so that its readings are fetched once for all
+LANES = 16  # the number of poses in a chunk is a multiple of this, so that vector registers are full
 ADD_ANGLE, PLACE, MOVE, FIRST_STEP, FIRST_TURN, MOVED_STEP, STEP, STEP_MOVE, TWO_STEPS, COMPARE = range(
     10
-)  # what is done to a chunk
+)  # codes of the steps of a chunk
 
-# The functions below take whole arrays and where to begin: slices made inside them cost nothing.
+# The functions below take whole arrays and start indices, as slices inside them are free.
 
 
 @part()
@@ -62,7 +62,7 @@ def _move(length: Working, begin: int, slide: Working, number: int, n: int, work
 
 @part()
 def _first_step(table: Working, begin: int, constant: Working, segment: int, end: int, n: int, work: Working) -> None:
-    """Take the first step, of the driven rotation nearest to a prism at a constant place: no coordinates go in."""
+    """Take the first step, about the driven rotation nearest to a prism at a fixed position; reads no coordinates."""
     driven = table[begin:]
     x, y, z = constant[end, 4], constant[end, 5], constant[end, 8]
     cb, sb, a, b = constant[segment, 2], constant[segment, 3], constant[segment, 4], constant[segment, 5]
@@ -103,7 +103,7 @@ def _moved_step(
     n: int,
     work: Working,
 ) -> None:
-    """Take the first step for a prism that a driven length moves: no coordinates go in."""
+    """Take the first step for a prism that a driven length moves; reads no coordinates."""
     driven, out = table[begin:], length[moved:]
     px, py, pz = constant[end, 4], constant[end, 5], constant[end, 8]
     sx, sy, sz = slide[number, 0], slide[number, 1], slide[number, 2]
@@ -147,7 +147,7 @@ def _step_move(
 def _two_steps(
     turned: Working, begin: int, constant: Working, segment: int, other_begin: int, other: int, n: int, work: Working
 ) -> None:
-    """Take two steps in one go: in between, the coordinates stay in registers."""
+    """Take two steps at once, with the coordinates kept in registers between them."""
     driven, other_driven = turned[begin:], turned[other_begin:]
     cb, sb, a, b = constant[segment, 2], constant[segment, 3], constant[segment, 4], constant[segment, 5]
     cb2, sb2, a2, b2 = constant[other, 2], constant[other, 3], constant[other, 4], constant[other, 5]
@@ -165,7 +165,7 @@ def _two_steps(
 
 @part()
 def _squares(target: Working, begin: int, ca: Any, sa: Any, n: int, work: Working) -> Any:
-    """Return the sum of weighted squared distances from the targets of the coordinates turned about z."""
+    """Return the sum of weighted squared distances of the coordinates, turned about z, from their targets."""
     own = target[begin:]
     total = work.dtype.type(0.0)
     for m in range(n):
@@ -195,7 +195,7 @@ def _robust_squares(target: Working, begin: int, ca: Any, sa: Any, n: int, work:
 
 @part()
 def _errors(target: Working, begin: int, ca: Any, sa: Any, n: int, work: Working, error: Working) -> None:
-    """Fill `error` with the errors of the coordinates turned about z, laid out as the targets."""
+    """Fill `error` with the errors of the coordinates turned about z, in the layout of the targets."""
     own, out = target[begin:], error[begin:]
     for m in range(n):
         x, y = work[m], work[CHUNK + m]
@@ -206,7 +206,7 @@ def _errors(target: Working, begin: int, ca: Any, sa: Any, n: int, work: Working
 
 @part()
 def _pair_squares(error: Working, pair: Integers, weight: Floats, inverse_scale: float) -> float:
-    """Return the sum of robust weighted squared differences between the errors at the places `pair` (k, 2)."""
+    """Return the sum of robust weighted squared differences between the errors at indices `pair` (k, 2)."""
     total = 0.0
     for k in range(len(pair)):
         square = 0.0
@@ -220,7 +220,7 @@ def _pair_squares(error: Working, pair: Integers, weight: Floats, inverse_scale:
 
 @part()
 def _of_candidate(constants: Floats, slides: Floats, candidate: int, constant: Working, slide: Working) -> None:
-    """Copy a candidate's own constants and slides, in the precision of the work."""
+    """Copy a candidate's constants and slides, in the precision of the loops."""
     block, j = candidate // BLOCK, candidate % BLOCK
     for k in range(len(constant)):
         for i in range(9):
@@ -231,7 +231,7 @@ def _of_candidate(constants: Floats, slides: Floats, candidate: int, constant: W
 
 
 @compiled
-def fitness(  # noqa: PLR0912, PLR0915 - calling a function that chooses the loop would double the time
+def fitness(  # noqa: PLR0912, PLR0915 - a function call for each choice of a loop would double the time
     constants: Floats,
     slides: Floats,
     todo: Integers,
@@ -249,16 +249,16 @@ def fitness(  # noqa: PLR0912, PLR0915 - calling a function that chooses the loo
     """Fill `out` with the fitness of candidates.
 
     Args:
-        constants: of blocks of candidates, as `chain_reduction.reduce_chain` returns them.
-        slides: likewise.
+        constants: constants of blocks of candidates, from `chain_reduction.reduce_chain`.
+        slides: slides of blocks of candidates, from the same.
         todo: as `layout.Layout`.
         chunk: as `layout.Layout`.
-        table: as `layout.Layout`; it decides the precision, as `length` and `target` do.
+        table: as `layout.Layout`; its type, which `length` and `target` share, determines the precision.
         length: as `layout.Layout`.
         target: as `layout.Layout`.
         turns: number of driven angles.
         lengths: number of driven lengths.
-        pair: (k, 2) places of pairs of observations in `target`.
+        pair: (k, 2) indices of pairs of observations in `target`.
         pair_weight: (k,) weight of each squared difference of two errors.
         inverse_scale: 1 / c^2 of the robust function, 0 for plain squares.
         out: (candidates,) result.

@@ -1,8 +1,9 @@
-"""Gravity's load on every joint: the virtual work of the machine's weights, for any rig with masses.
+"""Gravity loads on every joint by the virtual work of the machine's weights, for any rig with masses.
 
 The second paper's Eqs. 9-11 (ICIC 2020): the torque of joint i is the sum over the masses that it carries of
-(z_i x l_ij) . F_j, and (z_i x l_ij) is what the joint does to the place of mass j. So the loads are J_q' F, with a
-Jacobian of the masses' places by the readings, which holds for couplings, prismatic joints and branching rows too.
+(z_i x l_ij) . F_j, where (z_i x l_ij) is the derivative of the position of mass j by the joint. So the loads are
+J_q' F, with the Jacobian of the masses' positions by the readings. This is also valid for couplings, prismatic joints
+and branching rows.
 """
 
 from __future__ import annotations
@@ -18,23 +19,23 @@ from calibration.observations import Floats, Observations
 from calibration.rig.description import Rig
 
 STANDARD_GRAVITY = 9.80665  # m/s^2
-MASS_SIGMA = 0.15 / math.sqrt(3.0)  # a rig file's masses and centres of gravity are within +-15 % of the machine's
-_LEAST_LOAD = 1e-6  # of the largest load; a joint with less than this in every pose carries nothing
-_LEVEL = math.cos(math.radians(10.0))  # a station's frame that is further off the rig file's vertical is not levelled
+MASS_SIGMA = 0.15 / math.sqrt(3.0)  # masses and centres of gravity in a rig file are accurate to +-15 %
+_LEAST_LOAD = 1e-6  # of the largest load; a joint with less than this in every pose counts as unloaded
+_LEVEL = math.cos(math.radians(10.0))  # a station's frame farther from the rig file's vertical is not levelled
 
 
 class GravityModel:
-    """Gravity's load on the joints of a machine whose parameters stay; build it once and ask for any rows.
+    """Gravity loads on the joints of a machine with fixed parameters; build it once and evaluate any rows.
 
     Args:
-        chain: kinematics; where its bases stand counts in `down` alone.
-        x: (p,) its parameters.
+        chain: kinematics; the placements of its bases affect `down` alone.
+        x: (p,) parameters of the chain.
 
     Attributes:
-        direction: (1, 3) unit vector of gravity in the base frame, as the rig file has it.
-        down: (setups, 3) the same at each set-up, by a levelled station.
-        point_frame: (points,) the frame of every point at which weight hangs.
-        point_mass: (points,) index of the mass of each.
+        direction: (1, 3) unit vector of gravity in the base frame, from the rig file.
+        down: (setups, 3) the same at each set-up, as given by a levelled station.
+        point_frame: (points,) frame of every point at which a weight acts.
+        point_mass: (points,) index of the mass at each point.
     """
 
     def __init__(self, chain: Chain, x: Floats) -> None:
@@ -53,14 +54,14 @@ class GravityModel:
         self._unit = np.array([math.degrees(1.0) / 1e3 if j.kind == "revolute" else 1.0 for j in rig.joints])
 
     def places(self, readings: Floats, extra: Mapping[str, Floats]) -> tuple[Floats, Floats]:
-        """Return where the weights hang; no points where the rig has no masses.
+        """Return positions and sizes of the weights; there are no points if the rig has no masses.
 
         Args:
             readings: as for a call.
             extra: as for a call.
 
         Returns:
-            (n, points, 3) mm in the base frame; (n, points) how heavy they are, N.
+            (n, points, 3) positions in the base frame, mm, and (n, points) weights, N.
         """
         places_mm = np.empty((len(readings), len(self.point_frame), 3))
         chain_loops.places(
@@ -70,9 +71,9 @@ class GravityModel:
         return places_mm, np.broadcast_to(force, (len(readings), force.shape[1]))
 
     def parts(self, readings: Floats, extra: Mapping[str, Floats], down: Floats | None = None) -> Floats:
-        """Return the changes of the loads when one mass, or one centre's distance, is `MASS_SIGMA` larger.
+        """Return the changes of the loads if one mass, or the distance of one centre, is larger by `MASS_SIGMA`.
 
-        The weights that a rig file gives are rarely weighed. Zero where the torque is measured.
+        The masses in a rig file are rarely measured. The changes are zero where the torque is measured.
 
         Args:
             readings: as for a call.
@@ -80,7 +81,7 @@ class GravityModel:
             down: as for a call.
 
         Returns:
-            (n, joints, parts) N m or N.
+            (n, joints, parts) changes, N m or N.
         """
         newton = self._newton(extra)
         out = [np.empty((*readings.shape, 0))]
@@ -103,7 +104,7 @@ class GravityModel:
 
         Args:
             readings: (n, joints) deg or mm.
-            extra: optional columns of the rows; `payload_kg` and `<name>_Nm` count.
+            extra: optional columns of the rows, of which `payload_kg` and `<name>_Nm` are used.
             down: (n, 3) unit vectors of gravity in the base frame; the rig file's by default.
         """
         if len(self._share):
@@ -117,13 +118,13 @@ class GravityModel:
         return load
 
     def _loads(self, readings: Floats, force: Floats, down: Floats | None, offsets_mm: Floats) -> Floats:
-        """Return the (n, joints) loads by forces at the points, N m or N.
+        """Return the (n, joints) loads due to forces at the points, N m or N.
 
         Args:
             readings: (n, joints) deg or mm.
-            force: (n, points) N; (1, points) for all rows alike.
-            down: (n, 3) along which they act; the rig file's direction by default.
-            offsets_mm: (points, 3) of the points in their frames.
+            force: (n, points) forces, N; (1, points) if equal in all rows.
+            down: (n, 3) direction of the forces; the rig file's by default.
+            offsets_mm: (points, 3) offsets of the points in their frames.
         """
         work = np.empty(readings.shape)
         along = np.ascontiguousarray(self.direction if down is None else down)
@@ -135,15 +136,15 @@ class GravityModel:
     def _down(self, base: Floats) -> Floats:
         """Return gravity (3,) in the frame of a base (7, 3).
 
-        The station is levelled, so that the base as found tells how the machine leans; loads that are about to change
-        their sign depend on tenths of a degree. The rig file says where gravity points in a frame that is not level.
+        As the station is levelled, the identified base shows the tilt of the machine; loads near a change of sign
+        depend on tenths of a degree. If the station's frame is not level, the direction of the rig file is used.
         """
         plumb, by_file = -base[2], self.direction[0]
         down: Floats = plumb if plumb @ by_file >= _LEVEL else by_file
         return down
 
     def _newton(self, extra: Mapping[str, Floats]) -> Floats:
-        """Return the weights (n, masses) with the payload of each row; (1, masses) where none is known."""
+        """Return the weights (n, masses) with the payload of each row; (1, masses) if there is no payload column."""
         payload = extra.get("payload_kg")
         if payload is None:
             return self._weights
@@ -152,27 +153,27 @@ class GravityModel:
 
 
 def gravity_torques(chain: Chain, x: Floats, observations: Observations) -> Floats:
-    """Return gravity's generalised force (n, joints) in the rig's order: N m (revolute) or N (prismatic).
+    """Return the generalised forces of gravity (n, joints) in the rig's order: N m (revolute) or N (prismatic).
 
-    Its sign is that of the load: tau = -dE/dq of the potential energy, so a positive one drives the joint's value up.
-    A joint that drives several rows has the sum. Gravity points as the rig file says, in the base frame; the payload
-    weighs `payload_kg` in the rows that have it. Measured torques (`<name>_Nm`, of revolute joints, with the same sign)
-    take the place of computed ones row by row.
+    The sign is that of the load: tau = -dE/dq of the potential energy, so a positive load increases the joint's value.
+    The load of a joint that drives several rows is the sum over these. The direction of gravity in the base frame is
+    from the rig file. The payload is `payload_kg` in rows that have it. Measured torques (`<name>_Nm`, of revolute
+    joints, with the same sign) replace computed ones row by row.
 
     Args:
-        chain: kinematics; where its bases stand plays no part.
-        x: (p,) its parameters.
+        chain: kinematics; the placements of its bases are not used.
+        x: (p,) parameters of the chain.
         observations: n rows.
 
     Returns:
-        NaN where a torque is neither measured nor, for want of masses, to be computed.
+        (n, joints) loads; NaN where a torque is not measured and cannot be computed without masses.
     """
     readings = np.array([observations.joints[name] for name in chain.joint_index]).T
     return GravityModel(chain, x)(readings, observations.extra)
 
 
 def loaded_joints(rig: Rig, torques: Floats) -> tuple[int, ...]:
-    """Return the indices of revolute joints whose torque (n, joints) is known in every row and not zero throughout."""
+    """Return the indices of revolute joints whose torque (n, joints) is known in every row and not always zero."""
     known = np.isfinite(torques).all(axis=0)
     turning = np.array([joint.kind == "revolute" for joint in rig.joints])
     most = np.abs(np.where(known, torques, 0.0)).max(axis=0, initial=0.0)
@@ -186,9 +187,9 @@ def torque_columns(rig: Rig) -> tuple[str, ...]:
 
 
 def _points(rig: Rig) -> tuple[list[int], Floats, Floats]:
-    """Return the points at which the masses hang: frames, (m, 3) places in them, (masses, m) share of each mass.
+    """Return the points at which the masses act: frames, (m, 3) offsets in them, and (masses, m) share of each mass.
 
-    A mass midway between two origins is half at each: that has the same weight, moment and energy.
+    Half of a mass midway between two origins is put at each origin, which has the same weight, moment and energy.
     """
     origin = (0.0, 0.0, 0.0)
     places: list[tuple[int, tuple[float, float, float], int, float]] = []

@@ -1,6 +1,6 @@
 """A calibrated model as files: TOML, JSON, LightGBM's text and npz without pickle, under a SHA-256 manifest.
 
-Nothing is parsed before its hash has been compared: LightGBM dies of a truncated file.
+Nothing is parsed before its checksum has been verified, because LightGBM crashes on a truncated file.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from calibration.errors import ModelError, RigError
 from calibration.identification.identifiability import Identifiability
 from calibration.identification.refinement import Prior
 from calibration.kinematics.chain import Chain, Placement
-from calibration.model.model import CalibratedModel, Coverage, LearnedResidual, Outlier
+from calibration.model.model import CalibratedModel, LearnedResidual, Outlier, TrainingExtent
 from calibration.numerics.stored_arrays import (
     LARGEST,
     check_covariance,
@@ -45,17 +45,17 @@ VERSION = 3
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Bounded = Annotated[float, Field(gt=-LARGEST, lt=LARGEST, allow_inf_nan=False)]
-Setting = Annotated[float, Field(ge=-1e12, le=1e12, allow_inf_nan=False)]  # as `time_s`, which may count from 1970
+Setting = Annotated[float, Field(ge=-1e12, le=1e12, allow_inf_nan=False)]  # wide enough for `time_s` counted from 1970
 Size = Annotated[float, Field(ge=0.0, le=LARGEST, allow_inf_nan=False)]
 Variance = Annotated[float, Field(ge=0.0, le=LARGEST**2, allow_inf_nan=False)]
 Multiple = Annotated[float, Field(gt=0.0, le=LARGEST, allow_inf_nan=False)]
-Plausible = Annotated[float, Field(ge=1e-30, le=LARGEST, allow_inf_nan=False)]  # families divide by it
+Plausible = Annotated[float, Field(ge=1e-30, le=LARGEST, allow_inf_nan=False)]  # effect families divide by it
 Count = Annotated[int, Field(ge=0)]
 Triple = tuple[Bounded, Bounded, Bounded]
 
-_DOCUMENT_MAX_BYTES = 8 << 20  # 300 joints, prisms and set-ups take a tenth of it
+_DOCUMENT_MAX_BYTES = 8 << 20  # 300 joints, prisms and set-ups need a tenth of that
 
-# Beside KeyError: what the parsers of JSON and TOML and the learners end with on hostile bytes.
+# Errors, in addition to KeyError, that the parsers of JSON and TOML and the learners raise for hostile bytes.
 _UNREADABLE = (ArithmeticError, AttributeError, IndexError, MemoryError, RuntimeError, TypeError, ValueError, RigError)
 
 
@@ -161,26 +161,26 @@ class _Document(_Part):
     ranges: dict[str, tuple[Bounded, Bounded]]
     torques: tuple[str, ...]
     payload: tuple[Variance, Variance] | None
-    loads: dict[str, tuple[Setting, Setting]] = {}  # models from before have none
+    loads: dict[str, tuple[Setting, Setting]] = {}  # absent in older models
     outliers: tuple[_Outlier, ...]
     residual: _Residual | None
     trials: tuple[_Trial, ...]
     residual_reason: str
     intervals: _Intervals
-    effects_intervals: _Intervals | None = None  # models from before have none
+    effects_intervals: _Intervals | None = None  # absent in older models
     warnings: tuple[str, ...]
-    fitted_rows: tuple[str, ...] = ()  # models from before have none
+    fitted_rows: tuple[str, ...] = ()  # absent in older models
     provenance: dict[str, str | int | Finite]
 
 
-# Fields of the document that the model, or its coverage, has by the same name.
-_COVERAGE = tuple(field.name for field in fields(Coverage))
+# Fields of the document with the same name in the model or in its coverage.
+_COVERAGE = tuple(field.name for field in fields(TrainingExtent))
 _SAME = _Document.model_fields.keys() & {field.name for field in fields(CalibratedModel)}
 _SAME -= {"rig", "placements", "residual", "intervals"}
 
 
 def model_to_files(model: CalibratedModel) -> dict[str, bytes]:
-    """Write a model as named files, `manifest.json` with their sizes and SHA-256 among them."""
+    """Return a model as named files, including `manifest.json` with their sizes and SHA-256 checksums."""
     residual = model.residual
     learned = residual.learner.to_files() if residual else {}
     stages = zip(model.parameters, model.geometric_values, model.nominal_values, strict=True)
@@ -229,10 +229,10 @@ def model_to_files(model: CalibratedModel) -> dict[str, bytes]:
 
 
 def check_manifest(files: Mapping[str, bytes]) -> dict[str, bytes]:
-    """Compare files with the manifest among them, and return those that it lists.
+    """Verify files against their manifest, and return those that it lists.
 
     Raises:
-        ModelError: no manifest, another version, a file missing, truncated or edited.
+        ModelError: there is no manifest, the version is not supported, or a file is missing, truncated or edited.
     """
     if MANIFEST not in files:
         raise ModelError(f"{MANIFEST} is missing: this is not a rigcal model")
@@ -242,7 +242,7 @@ def check_manifest(files: Mapping[str, bytes]) -> dict[str, bytes]:
         raise ModelError(f"{MANIFEST} is damaged ({_first(error)}); calibrate again or restore the model") from error
     if manifest.version != VERSION:
         raise ModelError(
-            f"the model has format version {manifest.version}, this program reads version {VERSION}; calibrate again"
+            f"the model has format version {manifest.version}, this program supports version {VERSION}; calibrate again"
         )
     checked: dict[str, bytes] = {}
     for name, listed in manifest.files.items():
@@ -252,7 +252,7 @@ def check_manifest(files: Mapping[str, bytes]) -> dict[str, bytes]:
         if len(data) < listed.bytes:
             raise ModelError(f"{name} is truncated ({len(data)} of {listed.bytes} bytes); restore the model")
         if hashlib.sha256(data).hexdigest() != listed.sha256:
-            raise ModelError(f"{name} is not as it was written (SHA-256 differs); restore the model")
+            raise ModelError(f"{name} was changed after it was written (SHA-256 differs); restore the model")
         checked[name] = data
     return checked
 
@@ -261,10 +261,11 @@ def model_from_files(files: Mapping[str, bytes]) -> CalibratedModel:
     """Read a model from named files, the inverse of `model_to_files`.
 
     Args:
-        files: name -> content; files that the manifest does not list are left aside.
+        files: name -> content; files that the manifest does not list are ignored.
 
     Raises:
-        ModelError: truncated, edited, of another version, or not a model; one sentence.
+        ModelError: the model is truncated, edited or of an unsupported version, or the files are not a model. The
+            message is one sentence.
     """
     checked = check_manifest(files)
     if len(checked.get("model.json", b"")) > _DOCUMENT_MAX_BYTES:
@@ -310,7 +311,7 @@ def model_from_files(files: Mapping[str, bytes]) -> CalibratedModel:
         covariance=covariance,
         geometric_values=np.array([p.geometric_stage_value for p in document.parameters]),
         nominal_values=np.array([p.nominal_stage_value for p in document.parameters]),
-        coverage=Coverage(**{name: getattr(document, name) for name in _COVERAGE}),
+        coverage=TrainingExtent(**{name: getattr(document, name) for name in _COVERAGE}),
         residual=residual,
         base_covariance=base_covariance,
     )
@@ -323,17 +324,17 @@ def _read_residual(part: _Residual, files: Mapping[str, bytes]) -> LearnedResidu
 
 
 def _check_residual(residual: LearnedResidual, chain: Chain) -> None:
-    """Raise ModelError where learner or region do not fit the rig or each other."""
+    """Raise ModelError if learner and region do not match the rig or each other."""
     if not residual.learner.fits(no_features(chain, residual.signals)):
-        raise ModelError("the residual was trained on other features than the model's rig has; calibrate again")
+        raise ModelError("the features of the residual differ from those of the model's rig; calibrate again")
     if not residual.region.fits(len(chain.rig.joints)):
-        raise ModelError("the residual's region does not fit the model's rig; calibrate again")
+        raise ModelError("the residual's region does not match the model's rig; calibrate again")
     if residual.region.signals != residual.signals:
-        raise ModelError("the residual's region was fitted with other signals than model.json has; calibrate again")
+        raise ModelError("the signals of the residual's region differ from those in model.json; calibrate again")
 
 
 def _stage_intervals(document: _Document) -> StageIntervals:
-    """Intervals of both stages; a model from before has none of its stage effects, and those at least normal ones."""
+    """Return the intervals of both stages; those of stage effects, absent in older models, are then at least normal."""
     hybrid = Intervals(**dict(document.intervals))
     if document.effects_intervals is not None:
         return StageIntervals(hybrid, Intervals(**dict(document.effects_intervals)))
@@ -343,7 +344,7 @@ def _stage_intervals(document: _Document) -> StageIntervals:
 def _check_parts(document: _Document, chain: Chain, covariance: np.ndarray, base_covariance: np.ndarray | None) -> None:
     expected = [p.name for p in chain.parameters]
     if [p.name for p in document.parameters] != expected:
-        raise ModelError("the parameters of model.json are not those of its rig; calibrate again")
+        raise ModelError("the parameters of model.json differ from those of its rig; calibrate again")
     size = len(expected) + sum(len(effect.coefficients) for effect in document.effects)
     check_covariance(covariance, size, "parameters and effects")
     if base_covariance is not None:
@@ -356,25 +357,25 @@ def _check_parts(document: _Document, chain: Chain, covariance: np.ndarray, base
     ranges = (*document.ranges.items(), *document.loads.items())
     reversed_ranges = [name for name, (low, high) in ranges if low > high]
     if reversed_ranges:
-        raise ModelError(f"a range of joint {reversed_ranges[0]!r} in model.json ends before it begins")
+        raise ModelError(f"a range of joint {reversed_ranges[0]!r} in model.json ends before it starts")
 
 
 def _read_effect(part: _Effect, chain: Chain) -> FittedEffect:
-    """Read an effect; raise ModelError where this program's family of that name would compute something else."""
+    """Read an effect; raise ModelError if this program's family of that name is not compatible with it."""
     family = library().get(part.family)
     if family is None or part.where not in family.places(chain.rig):
-        raise ModelError(f"model.json has effect {part.family}@{part.where}, which this program cannot place")
+        raise ModelError(f"model.json has effect {part.family}@{part.where}, which this program does not have there")
     coefficients = tuple(FittedCoefficient(**dict(c)) for c in part.coefficients)
     try:
         names = family.names(part.settings)
     except ValueError as error:
-        raise ModelError(f"model.json has effect {part.family}@{part.where} in no form it takes: {error}") from error
+        raise ModelError(f"model.json has effect {part.family}@{part.where} in an invalid form: {error}") from error
     if tuple(c.name for c in coefficients) != names:
         raise ModelError(f"effect {part.family}@{part.where} of model.json needs the coefficients {', '.join(names)}")
     regime = None if part.regime is None else Regime(**dict(part.regime))
     if regime is not None and not regime.is_possible(chain.rig):
         raise ModelError(
-            f"effect {part.family}@{part.where} of model.json depends on {regime.variable}, which is not there"
+            f"effect {part.family}@{part.where} of model.json depends on {regime.variable}, which does not exist"
         )
     return FittedEffect(part.family, part.where, coefficients, part.settings, regime)
 

@@ -1,4 +1,4 @@
-"""Prediction intervals of a model, counted on its own training rows as if their groups had been left out."""
+"""Prediction intervals of a model, calibrated on its training rows as if their groups had been left out."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from calibration.observations import Floats, Observations
 from calibration.residual.conformal import Coverage, StageIntervals, conformal_intervals, coverage
 from calibration.residual.folds import neighbour_labels
 
-_LARGEST_GROUP = 40  # samples: the work of a group grows with the cube of their number
+_LARGEST_GROUP = 40  # samples; the work for a group is proportional to the cube of their number
 
 
 def with_intervals(
@@ -23,13 +23,13 @@ def with_intervals(
     learned: NDArray[np.bool_] | None = None,
     left_mm: Floats | None = None,
 ) -> CalibratedModel:
-    """Give a model intervals that hold the errors of new fixes of the same kind, outliers among them.
+    """Return a model with intervals that contain 90 % of the errors of similar new fixes, including outliers.
 
     Args:
-        model: fitted to these rows; one with a residual learner has the intervals of its stage before already.
-        observations: n rows, none of them copies.
-        learned: (n,) rows that the residual learner was trained on, for a model that has one.
-        left_mm: (k, 3) errors on these rows of learners trained without them, in the station's frame.
+        model: fitted to these rows; a model with a residual learner must already have intervals of stage effects.
+        observations: n rows without copies.
+        learned: (n,) mask of the k rows on which the residual learner was trained, for a model that has one.
+        left_mm: (k, 3) out-of-fold errors of the learner on these rows, in the station's frame.
     """
     prediction = Predictor.of(model).predict(observations)
     error = observations.position_mm - prediction.position_mm
@@ -43,15 +43,15 @@ def with_intervals(
 
 @dataclass(frozen=True)
 class SetupErrors:
-    """Errors of a model on the fixes that its base was fitted to, each as if its group had been left out of that fit.
+    """Errors of a model on the fixes to which its base was fitted, each as if its group had been left out of that fit.
 
     Attributes:
         error_mm: (n, 3) measured minus predicted, in the station's frame.
-        prediction: of the rows.
-        home: intervals of the model's training.
-        half: (n,) 0 or 1; groups, which are stretches of a path or cells, are wholly in one of them.
-        samples: how many of the rows are independent of each other.
-        has_one_setup: whether x and y point the same way in all rows.
+        prediction: prediction for the rows.
+        home: intervals from the model's training.
+        half: (n,) 0 or 1; all rows of a group (stretch of a path or cell) have the same.
+        samples: number of mutually independent rows.
+        has_one_setup: whether all rows are from one set-up, where x and y keep their directions.
     """
 
     error_mm: Floats
@@ -63,7 +63,7 @@ class SetupErrors:
 
     @classmethod
     def of(cls, model: CalibratedModel, observations: Observations) -> SetupErrors:
-        """The errors of a model with a refitted base on the n rows that this was fitted to."""
+        """Compute the errors of a model with a refitted base on the n rows to which the base was fitted."""
         assert model.base_covariance is not None
         prediction = Predictor.of(model).predict(observations)
         error = observations.position_mm - prediction.position_mm
@@ -74,14 +74,14 @@ class SetupErrors:
 
     @property
     def intervals(self) -> StageIntervals:
-        """Intervals that hold at these set-ups too, and are nowhere narrower than those of the training.
+        """Intervals that are also valid at these set-ups, and never narrower than those from the training.
 
-        What a machine does elsewhere that it did not do in its training is in these errors and nowhere else.
+        Only these errors show behaviour of the machine at other set-ups that did not occur in its training.
         """
         return self._counted(np.ones(len(self.half), dtype=np.bool_))
 
     def coverage(self) -> Coverage:
-        """Share of the errors inside intervals that were counted on the other half of them."""
+        """Return the share of errors inside intervals that were calibrated on the other half of the rows."""
         formal_mm, weight = self.prediction.formal_mm, self.prediction.weight
         half_mm, radius_mm = np.empty_like(formal_mm), np.empty(len(formal_mm))
         for half in range(2):
@@ -92,7 +92,7 @@ class SetupErrors:
         return coverage(self.error_mm, half_mm, radius_mm)
 
     def _counted(self, rows: NDArray[np.bool_]) -> StageIntervals:
-        """Intervals of the training, widened so that they hold the errors of some of the rows."""
+        """Return the intervals from the training, widened to contain 90 % of the errors of some of the rows."""
         if not rows.any():
             return self.home
         independent = max(1, round(self.samples * float(rows.mean())))
@@ -108,21 +108,21 @@ def _left_out(
     fitted: slice,
     covariance: Floats,
 ) -> tuple[Floats, int]:
-    """Return the errors that rows would have, had the fit not seen their group; outliers it did not follow.
+    """Return the errors that rows would have if their group had been left out of the fit.
 
     Args:
         model: the model.
         observations: n rows.
-        error_mm: (n, 3) of the rows.
+        error_mm: (n, 3) errors of the rows.
         group: (n,) number of each row's group.
-        fitted: which parameters and coefficients were.
-        covariance: (f, f) of these.
+        fitted: the f parameters and coefficients that were fitted.
+        covariance: (f, f) covariance of these.
 
     Returns:
-        (n, 3) errors, mm; how many of the rows are independent of each other.
+        (n, 3) errors, mm; and the number of mutually independent rows.
     """
     followed = np.ones(len(observations), dtype=bool)
-    # The fit has not followed outliers: they are no nearer for it, nor is anything farther without them.
+    # The fit did not follow outliers, so leaving them out changes neither their own error nor those of others.
     followed[[o.row for o in Predictor.of(model).find_outliers(observations)]] = False
     rows = observations.select(followed)
     lin = Predictor.of(model).linearise(rows)
@@ -144,12 +144,12 @@ def _left_out(
 
 
 def _groups(observations: Observations) -> NDArray[np.intp]:
-    """(n,) number of each row's stretch of a path or cell."""
+    """Return the (n,) number of each row's stretch of a path or cell."""
     return np.asarray(np.unique(neighbour_labels(observations), return_inverse=True)[1].reshape(-1), dtype=np.intp)
 
 
 def _blocks(group: NDArray[np.intp], samples: Samples) -> NDArray[np.intp]:
-    """(m,) number of each sample's group, given that of its rows; in pieces where too many for one block are in it."""
+    """Return the (m,) group number of each sample from those of its rows; large groups are divided into blocks."""
     out = np.zeros(len(samples), dtype=np.intp)
     out[samples.of_row] = group
     order = np.argsort(out, kind="stable")

@@ -1,11 +1,11 @@
-"""Inverse of a calibrated model: the joint values to command for wanted positions of prisms.
+"""Inverse of a calibrated model: joint values to command for target positions of prisms.
 
-Newton's method through the whole model: the kinematics have an exact Jacobian, effects and learned residual one by
-differences over a thousandth of each joint's range, which smooths over the steps of trees. Of all joint values that
-bring the prisms to their targets (a boom has more joints than a target has coordinates) the step goes to those nearest
-the nominal command, distances in ranges of the joints: d = d_0 + A+ (e - A d_0), A the Jacobian in these units, with
-the joints at their limits taken out (active set). It is damped as by Levenberg and Marquardt where it would not bring
-the prisms nearer. Only the branch of solutions at the nominal command is searched.
+Newton's method on the whole model. The Jacobian of the kinematics is exact; that of effects and learned residual is by
+differences over a thousandth of each joint's range, which smooths the steps of trees. A boom has more joints than a
+target has coordinates; of all joint values that bring the prisms to their targets, the step selects those nearest the
+nominal command, with distances in ranges of the joints: d = d_0 + A+ (e - A d_0), where A is the Jacobian in these
+units, without joints at their limits (active set). Where the step would not bring the prisms nearer, it is damped as by
+Levenberg and Marquardt. Only the branch of solutions at the nominal command is searched.
 """
 
 from __future__ import annotations
@@ -25,19 +25,19 @@ from calibration.observations import Floats, Observations
 Integers = NDArray[np.intp]
 Flags = NDArray[np.bool_]
 
-CLOSURE_MM = 0.01  # a target is reached if the model has its prism so near
+CLOSURE_MM = 0.01  # a target is reached if the model's prism is nearer than this
 
-_CLOSE_MM = 1e-3  # what the iterations aim at
-_STILL = 1e-5  # in ranges of the joints: a smaller move towards the nominal command is none
+_CLOSE_MM = 1e-3  # goal of the iterations
+_STILL = 1e-5  # in ranges of the joints; smaller moves towards the nominal command are negligible
 _NO_STEP = 1e-9  # in ranges of the joints
-_LONGEST = 0.1  # step, in the same
+_LONGEST = 0.1  # greatest step, in the same unit
 _DIFFERENCE = 1e-3  # of a joint's range
-_STIFF, _SOFT = 1e-6, 1e-12  # of the largest eigenvalue of A A': what moves prisms so little is left alone
+_STIFF, _SOFT = 1e-6, 1e-12  # of the largest eigenvalue of A A'; directions with smaller ones are not used
 _ROUNDS, _SOFT_ROUNDS, _DAMPED_ROUNDS = 8, 16, 50
 _FIRST_DAMPING = 1e-3  # of the largest eigenvalue
-_LEAST_GAIN = 1e-3  # of the distance; a pose that gains less for some rounds stays where it is
+_LEAST_GAIN = 1e-3  # of the distance; a pose that gains less for `_PATIENCE` rounds is final
 _PATIENCE = 4
-_STUCK_MM = 1.0  # nearer than this, the learned residual may be what keeps a pose from its target
+_STUCK_MM = 1.0  # below this distance, steps of the learned residual may keep a pose from its target
 _NUDGES = (3e-3, 1e-2, 3e-2)  # in ranges of the joints
 _CHORDS = 8
 _TOGETHER = 500  # poses
@@ -48,9 +48,9 @@ class Inverse:
     """Joint values that bring prisms to their targets.
 
     Attributes:
-        observations: the rows given, with the joint values to command.
-        closure_mm: (n,) distance that the model then has between each prism and its target.
-        warnings: about targets out of reach, and about using the model for these commands.
+        observations: the given rows with the joint values to command.
+        closure_mm: (n,) distance between each target and its prism, as predicted by the model for these values.
+        warnings: warnings about targets out of reach, and about using the model for these commands.
     """
 
     observations: Observations
@@ -64,21 +64,23 @@ class Inverse:
 
 
 def inverse(model: CalibratedModel, targets: Observations) -> Inverse:
-    """Find the joint values with which the model has prisms at their targets.
+    """Find the joint values for which the model predicts the prisms at their targets.
 
-    Rows of one session, set-up and pose are one pose and are solved together: two prisms of a feed give its attitude.
-    Where not all can be reached inside the limits of the joints, a pose comes as near as it can (least squares over its
-    rows), and the closures say how near.
+    Rows of one session, set-up and pose are one pose and are solved together: two prisms on a feed determine its
+    attitude. Where the targets of a pose cannot all be reached within the limits of the joints, the pose gets as near
+    as possible (least squares over its rows), and the closures give the remaining distances.
 
     Args:
-        model: the whole model counts: effects and residual too. Columns that they need are taken from the rows.
-        targets: n rows whose positions are where the prisms should be, in the frame of their set-up's station, and
-            whose joints are the nominal command: where the search begins and what the result stays nearest to.
-            Positions are those that the station would measure, as `predict` gives them, with what its fixes err by.
+        model: the model, of which effects and residual are inverted as well. Columns that they need are taken from the
+            rows.
+        targets: n rows. Their positions are the targets of the prisms, in the frame of their set-up's station, as the
+            station would measure them and `predict` returns them, including systematic errors of fixes. Their joints
+            are the nominal command, at which the search starts and to which the result stays as near as possible.
 
     Raises:
-        DataError: a row without a position, a joint value that is no number, rows of one pose with different commands.
-        UnsafeError: a set-up that the model does not know.
+        DataError: a row has no position or a joint value that is not finite, or rows of one pose have different
+            commands.
+        UnsafeError: the model does not know a set-up.
     """
     check_setups(model, targets)
     poses = _poses(targets)
@@ -103,8 +105,8 @@ class _State:
 
     Attributes:
         readings: (p, joints) deg or mm.
-        error: (p, 3 m) from the prisms to their targets, mm.
-        slope: (p, 3 m, joints) mm per range of each joint.
+        error: (p, 3 m) vectors from the prisms to their targets, mm.
+        slope: (p, 3 m, joints) derivatives of the prisms, mm per range of each joint.
     """
 
     readings: Floats
@@ -115,23 +117,23 @@ class _State:
         return _State(self.readings[rows], self.error[rows], self.slope[rows])
 
     def take(self, rows: Flags | Integers, other: _State) -> None:
-        """Put the poses of another state in place of these rows."""
+        """Replace these rows by the poses of another state."""
         self.readings[rows], self.error[rows], self.slope[rows] = other.readings, other.error, other.slope
 
     @property
     def distance(self) -> Floats:
-        """(p,) mm, over all prisms of a pose."""
+        """(p,) root of the summed squared errors of all prisms of a pose, mm."""
         size: Floats = np.sqrt((self.error**2).sum(axis=1))
         return size
 
 
 class _Search:
-    """p poses of m rows each.
+    """Search for the joint values of p poses of m rows each.
 
     Args:
-        model: what has to be inverted.
+        model: the model to invert.
         targets: all rows.
-        rows: (p, m) those of each pose.
+        rows: (p, m) row numbers of each pose.
     """
 
     def __init__(self, model: CalibratedModel, targets: Observations, rows: Integers) -> None:
@@ -162,11 +164,12 @@ class _Search:
         return np.flatnonzero(state.distance > _CLOSE_MM)
 
     def _freely(self, moving: Integers, state: _State, rank: float, rounds: int) -> None:
-        """Take Newton's steps, nearer or not, and keep the nearest places.
+        """Take Newton steps, even if they increase the distance, and keep the nearest state of each pose.
 
-        Most poses need no more. Prisms on one body, though, keep their distance but for what the learned residual makes
-        of it. To close that little the joints have to move far, along a curve that a straight step leaves: then a step
-        along it (small `rank`) and steps back to it take turns, and those do not lead towards the nominal command.
+        This is enough for most poses. The distance between prisms on one body, however, is fixed except for the
+        learned residual. To close such a small error the joints have to move far, along a curve from which straight
+        steps deviate. Then steps along the curve (small `rank`) alternate with steps back to it, and neither leads
+        towards the nominal command.
         """
         now = state.select(moving)
         for _ in range(rounds):
@@ -185,7 +188,7 @@ class _Search:
             state.take(moving[better], now.select(better))
 
     def _damped(self, moving: Integers, state: _State) -> None:
-        """Take damped steps (Levenberg and Marquardt) for as long as they bring the prisms nearer."""
+        """Take damped steps (Levenberg and Marquardt) as long as they bring the prisms nearer."""
         damping, ease = np.zeros(len(self._rows)), np.ones(len(self._rows))
         idle = np.zeros(len(self._rows), dtype=np.intp)
         for _ in range(_DAMPED_ROUNDS):
@@ -207,7 +210,7 @@ class _Search:
             moving = moving[(idle[moving] < _PATIENCE) & (state.distance[moving] > _CLOSE_MM)]
 
     def _at(self, poses: Integers, readings: Floats) -> _State:
-        """Poses at readings (p, joints)."""
+        """Evaluate poses at readings (p, joints)."""
         p, m, joints = len(poses), self._rows.shape[1], len(self._names)
         moved = readings[:, None, :]
         if self._bends:
@@ -227,7 +230,7 @@ class _Search:
         return _State(readings, error, slope.reshape(p, 3 * m, joints))
 
     def _observations(self, rows: Integers, readings: Floats) -> Observations:
-        """The rows (p, m) of each pose at readings (p, k, joints), prisms fastest."""
+        """Return the rows (p, m) of each pose at readings (p, k, joints); the prism's index varies fastest."""
         p, k, joints = readings.shape
         m = rows.shape[1]
         index = np.broadcast_to(rows[:, None, :], (p, k, m)).reshape(-1)
@@ -236,7 +239,7 @@ class _Search:
         return replace(found, joints=dict(zip(self._names, table.T.copy(), strict=True)))
 
     def _step(self, poses: Integers, now: _State, damping: Floats, ease: Floats, rank: Floats) -> tuple[Floats, Floats]:
-        """(p, joints) step inside the limits, in ranges, and the part of it that leads towards the nominal command."""
+        """Return the (p, joints) step within the limits, in ranges, and its part towards the nominal command."""
         away = (now.readings - self._nominal[poses]) / self._range
         low, high = (self._low - now.readings) / self._range, (self._high - now.readings) / self._range
         step, home = _least_change(now.slope, now.error, away, damping, ease, rank)
@@ -247,7 +250,7 @@ class _Search:
         return step, home
 
     def _nudge(self, pose: int, state: _State) -> None:
-        """Try starts beside a pose that steps of the residual keep from its target, along the null space."""
+        """Try starts next to a pose, along the null space, if steps of the residual keep it from its target."""
         one = np.array([pose])
         slope = state.slope[pose]
         _, size, rows = np.linalg.svd(slope)
@@ -273,18 +276,18 @@ class _Search:
 def _least_change(
     slope: Floats, error: Floats, away: Floats, damping: Floats, ease: Floats, rank: Floats
 ) -> tuple[Floats, Floats]:
-    """Damped step towards the targets and, across it, towards the nominal command.
+    """Compute the damped step towards the targets and, perpendicular to it, towards the nominal command.
 
     Args:
         slope: (p, 3 m, joints) A.
         error: (p, 3 m) e.
-        away: (p, joints) from the nominal command.
-        damping: (p,) added to the eigenvalues of A A'.
-        ease: (p,) share of the way towards the nominal command.
-        rank: (p,) of the largest eigenvalue; what moves the prisms less is left alone.
+        away: (p, joints) distance from the nominal command.
+        damping: (p,) term added to the eigenvalues of A A'.
+        ease: (p,) share of the way towards the nominal command to take.
+        rank: (p,) least eigenvalue, relative to the largest, of directions to use.
 
     Returns:
-        (p, joints) the step and (p, joints) the part of it that leaves the prisms in place.
+        The step (p, joints), and its part (p, joints) that does not move the prisms.
     """
     turned = slope.transpose(0, 2, 1)
     size, axes = np.linalg.eigh(slope @ turned)
@@ -307,9 +310,10 @@ def _within(
     low: Floats,
     high: Floats,
 ) -> tuple[Floats, Floats]:
-    """Do the same for a single pose, between bounds (joints,) of the step (active set).
+    """Compute the step as `_least_change` for a single pose, between bounds (joints,) of the step (active set).
 
-    Of a held joint, the multiplier says whether letting it go would bring the prisms nearer or lessen the change.
+    The multiplier of a joint held at its bound shows whether releasing it would bring the prisms nearer or reduce the
+    change.
     """
     held = np.zeros(len(low), dtype=bool)
     step, home = np.zeros(len(low)), np.zeros(len(low))
@@ -333,7 +337,7 @@ def _within(
 
 
 def _multiplier(slope: Floats, free_slope: Floats, rank: float, left: Floats, change: Floats) -> Floats:
-    """(joints,) derivative of the cost by each joint: of the miss where some is left, else of the change."""
+    """Return the (joints,) derivative by each joint of the remaining error or, if there is none, of the change."""
     by_miss = -slope.T @ left
     if np.abs(by_miss).max() > 1e-6 * np.square(slope).sum():
         return by_miss
@@ -342,7 +346,7 @@ def _multiplier(slope: Floats, free_slope: Floats, rank: float, left: Floats, ch
 
 
 def _check(model: CalibratedModel, targets: Observations, poses: list[list[int]]) -> None:
-    """Raise DataError for rows without numbers, and for poses that are commanded to be in two places."""
+    """Raise DataError for rows with missing numbers, and for poses with different commands."""
     if len(targets) == 0:
         raise DataError("targets", "there are none")
     if not np.isfinite(targets.position_mm).all():
@@ -363,7 +367,7 @@ def _check(model: CalibratedModel, targets: Observations, poses: list[list[int]]
 
 
 def _poses(targets: Observations) -> list[list[int]]:
-    """Rows of each pose, in the order of their first rows."""
+    """Return the rows of each pose, in the order of their first rows."""
     labels = zip(targets.session.tolist(), targets.setup.tolist(), targets.pose.tolist(), strict=True)
     poses: dict[tuple[str, str, str] | int, list[int]] = {}
     for row, label in enumerate(labels):
@@ -378,7 +382,7 @@ def _out_of_reach(
     if missed.any():
         worst = int(np.argmax(closure_mm))
         most, joints = max(len(rows) for rows in poses if missed[rows].any()), len(model.rig.joints)
-        asked = f"; {most} prisms of one pose ask for {3 * most} coordinates of {joints} joints"
+        asked = f"; {most} prisms of one pose have {3 * most} coordinates for {joints} joints"
         yield (
             f"{int(missed.sum())} of {len(missed)} targets are out of reach from their nominal commands, within the "
             f"limits of the joints: they are missed by up to {closure_mm[worst]:.3g} mm, in {commanded.row_name(worst)}"

@@ -1,7 +1,7 @@
-"""Error that kinematics and effects leave, as the size of an error of every joint, from the training data.
+"""Remaining error of kinematics and effects, expressed as an error of every joint and estimated from training data.
 
-An error that enters through the joints grows with the lever arm of each prism, which noise of the fixes does not; so
-the data say how much of their scatter is the model's and how much the instrument's.
+An error of the joints grows with the lever arm of each prism, whereas the noise of fixes does not. So the data show how
+much of their scatter is due to the model and how much to the instrument.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from calibration.numerics.matrices import traces
 from calibration.observations import Floats, Observations
 from calibration.rig.description import Rig
 
-_SURE = 5.0  # in log likelihood; less is chance
-_LINEARITY_DEG = 0.1  # of an encoder whose rig file gives none
+_SURE = 5.0  # gain in log likelihood; a smaller one may be chance
+_LINEARITY_DEG = 0.1  # of an encoder without linearity in the rig file
 _LINEARITY = 1e-3  # of a transducer's stroke
-_FLOOR = 0.1  # of the known variance: what a fitted row keeps at least
+_FLOOR = 0.1  # least variance of a fitted row, relative to its known variance
 
 
 def joint_error_sizes(rig: Rig) -> Floats:
-    """(joints,) systematic error of each joint that its rig file names (`linearity`), or a usual one, deg or mm."""
+    """Return the (joints,) systematic error of each joint, deg or mm: `linearity` of the rig file or a usual value."""
     return np.array(
         [
             (joint.linearity or _LINEARITY_DEG)
@@ -42,23 +42,23 @@ def joint_error_sizes(rig: Rig) -> Floats:
 
 
 def joint_error_scale(model: CalibratedModel, observations: Observations, *, structured: bool = False) -> float:
-    """Estimate the error that kinematics and effects leave, as one of every joint, in units of `joint_error_sizes`.
+    """Estimate the remaining error of kinematics and effects as a factor on `joint_error_sizes` of every joint.
 
     The errors of the training fixes have the covariance Sigma_known + s^2 I + k^2 J_q D J_q' - J C J': station and
-    readings, even noise, an error of the joints with the lever arms J_q, less what the fit took. Repeats are averaged.
-    Maximum likelihood in s and k, with k = 0 unless the data prefer another by 5 in log likelihood. For that the prisms
-    of a standstill count together, as a joint's error is the same at each; but the size of k is that of the fixes each
-    by itself, which holds also where what the model lacks moves the prisms of a standstill otherwise than joints do.
-    Where the lever arms are much the same everywhere, the data cannot prefer; what is known to have structure counts as
-    an error of the joints all the same.
+    readings, uniform noise, and an error of the joints with the lever arms J_q, minus the part that the fit absorbed.
+    Repeats are averaged. Both s and k are maximum-likelihood estimates, with k = 0 unless another value gains 5 in log
+    likelihood. For that comparison the prisms of a standstill are correlated, as a joint's error is the same for all of
+    them. The value of k, however, is estimated with independent fixes, so that it remains valid if errors that are
+    missing in the model move the prisms of a standstill differently than joints do. If all lever arms are nearly equal,
+    the data cannot distinguish the two. Errors that are known to be systematic then count as an error of the joints.
 
     Args:
         model: fitted to these rows; outliers are left out.
         observations: the training rows.
-        structured: True if the errors are known to depend on something, and so are no noise.
+        structured: True if the errors are known to be systematic and not noise.
 
     Returns:
-        k >= 0; 0 where even noise explains the scatter.
+        k >= 0; 0 if uniform noise explains the scatter.
     """
     rows = observations.select(Predictor.of(model).deviations(observations) <= OUTLIER_SIGMA)
     if len(rows) == 0:
@@ -76,13 +76,13 @@ def joint_error_scale(model: CalibratedModel, observations: Observations, *, str
 
 @dataclass(frozen=True)
 class _Groups:
-    """Groups of equally many samples that err together, g of them with c = 3 coordinates a sample.
+    """g groups of samples with correlated errors, all of the same size; c is 3 times the samples of a group.
 
     Attributes:
-        error: (g, c) measured minus modelled.
-        known: (g, c, c) covariance by station and readings.
-        by_joint: (g, c, c) covariance by an error of every joint in `joint_error_sizes`.
-        taken: (g, c, c) what the fit took.
+        error: (g, c) measured minus modelled, mm.
+        known: (g, c, c) covariance due to station and readings, mm^2.
+        by_joint: (g, c, c) covariance due to errors of all joints by their `joint_error_sizes`, mm^2.
+        taken: (g, c, c) covariance that the fit absorbed, mm^2.
     """
 
     error: Floats
@@ -92,12 +92,12 @@ class _Groups:
 
     @cached_property
     def least(self) -> Floats:
-        """(g, 1) variance that any combination of a group's coordinates keeps."""
+        """(g, 1) least variance of any combination of a group's coordinates."""
         least: Floats = _FLOOR * traces(self.known)[:, None] / self.error.shape[1]
         return least
 
     def cost(self, even: float, lever: float) -> float:
-        """Negative log likelihood for s^2 and k^2."""
+        """Return the negative log likelihood for s^2 and k^2."""
         covariance = self.known + even * np.eye(self.error.shape[1]) + lever * self.by_joint - self.taken
         value, vector = np.linalg.eigh(covariance)
         value = np.maximum(value, self.least)
@@ -106,7 +106,7 @@ class _Groups:
 
 
 def _groups(model: CalibratedModel, rows: Observations, samples: Samples, label: Integers) -> list[_Groups]:
-    """The samples in groups of one label (m,)."""
+    """Group the m samples by label (m,)."""
     rig = model.rig
     lin = Predictor.of(model).linearise(rows)
     error = samples.average(rows.position_mm - lin.position_mm)
@@ -136,13 +136,13 @@ def _groups(model: CalibratedModel, rows: Observations, samples: Samples, label:
 
 
 def _likeliest(groups: list[_Groups], excess_sigma_mm: float) -> tuple[float, float]:
-    """The likeliest size of an error of every joint, and what it gains in log likelihood over none."""
+    """Return the maximum-likelihood factor on the joint errors, and its gain in log likelihood over zero."""
     known, by_joint = _mean_variance(groups, "known"), _mean_variance(groups, "by_joint")
     if by_joint == 0.0:
         return 0.0, 0.0
 
     def cost(logarithms: Floats) -> float:
-        """Negative log likelihood for log s^2 and, where given, log k^2."""
+        """Return the negative log likelihood for log s^2 and, if given, log k^2."""
         even, lever = [*np.exp(logarithms), 0.0][:2]
         return sum(g.cost(even, lever) for g in groups)
 

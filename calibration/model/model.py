@@ -26,7 +26,7 @@ from calibration.rig.description import Rig
 
 @dataclass(frozen=True)
 class Outlier:
-    """A fix far off the others: its row (from 0) in the observations and its error in sigma."""
+    """An outlying fix: its row (from 0) in the observations and its error in sigma."""
 
     row: int
     sigma: float
@@ -38,9 +38,9 @@ class ParameterEstimate:
 
     Attributes:
         name, unit: as `kinematics.Parameter`; values are deviations from nominal, mm or rad.
-        kind: `row`, `prism` or `base`; a base's deviation is from the placement that the model holds.
-        value, standard_error: posterior.
-        prior_sigma: tolerance the fit used, infinity for none.
+        kind: `row`, `prism` or `base`; a base's deviation is from the placement in the model.
+        value, standard_error: posterior mean and standard deviation.
+        prior_sigma: tolerance used in the fit, infinity for none.
     """
 
     name: str
@@ -52,20 +52,20 @@ class ParameterEstimate:
 
     @property
     def pull(self) -> float:
-        """Correction in units of its tolerance; 0 where there is none."""
+        """Correction in units of its tolerance; 0 if it has no tolerance."""
         return self.value / self.prior_sigma if math.isfinite(self.prior_sigma) else 0.0
 
 
 @dataclass(frozen=True)
-class Coverage:
+class TrainingExtent:
     """Extent of the training data.
 
     Attributes:
         fixes: prism -> number of fixes.
         ranges: joint -> lowest and highest reading, deg or mm.
         torques: joints whose torque was measured in most rows.
-        payload: lowest and highest `payload_kg`; None where no row had it.
-        loads: joint with an effect of its load -> lowest and highest, N m.
+        payload: lowest and highest `payload_kg`; None if no row had it.
+        loads: joint with an effect of its load -> lowest and highest load, N m.
     """
 
     fixes: Mapping[str, int]
@@ -77,15 +77,15 @@ class Coverage:
 
 @dataclass(frozen=True)
 class LearnedResidual:
-    """A residual learner with what it needs to be used.
+    """A residual learner with all data needed to use it.
 
     Attributes:
         learner: the fitted learner.
         signals: optional columns among its features.
-        prisms: prisms it was trained on; for others it estimates nothing.
-        excess_variance_mm2: (3,) what held-out errors scatter beyond station and readings once it is added, along
-            the axes of the base frame; takes the place of `excess_sigma_mm`.
-        region: where it was trained; outside it fades.
+        prisms: prisms on which it was trained; the estimate for others is zero.
+        excess_variance_mm2: (3,) variance of held-out errors with the learner in excess of station and readings, along
+            the axes of the base frame; replaces `excess_sigma_mm`.
+        region: region in which it was trained; outside it the estimate fades to zero.
     """
 
     learner: Residual
@@ -95,14 +95,14 @@ class LearnedResidual:
     region: Region
 
     def estimate(self, seen: Features, trained: NDArray[np.bool_]) -> tuple[Floats, Floats]:
-        """Estimate the residual, faded outside the region where it was trained.
+        """Estimate the residual, fading to zero outside the region of the training data.
 
         Args:
             seen: features of n rows.
-            trained: (n,) True for prisms that it was trained on; elsewhere the estimate is zero.
+            trained: (n,) True for prisms on which it was trained; elsewhere the estimate is zero.
 
         Returns:
-            (n, 3) estimate in the base frame, mm; (n,) its weight, 0 to 1.
+            (n, 3) estimate in the base frame, mm; and its (n,) weight, 0 to 1.
         """
         settled, weight = self.region.confine(seen)
         weight *= trained
@@ -115,33 +115,33 @@ class CalibratedModel:
     """Data of a calibrated rig; `prediction`, `warnings`, `inverse` and `files` work on it.
 
     Attributes:
-        rig, rig_text: the rig description and the TOML it was read from.
-        placements: set-up -> where the base stands before the base parameters.
-        values: (p,) all parameters, as `Chain.parameters` orders them, fitted together with the effects.
-        covariance: (p + k, p + k) of them and of the coefficients of the effects.
-        geometric_values: (p,) fitted without the effects; the same where there are none, but for a refitted base,
-            which `values` have as it is beside the residual.
-        nominal_values: (p,) with base and unknown prism offsets fitted and all else as in the rig file.
+        rig, rig_text: the rig description and its TOML text.
+        placements: set-up -> placement of the base, to which the base parameters are corrections.
+        values: (p,) all parameters in the order of `Chain.parameters`, fitted together with the effects.
+        covariance: (p + k, p + k) covariance of the parameters and of the coefficients of the effects.
+        geometric_values: (p,) parameters fitted without the effects. Without effects they equal `values`, except for a
+            refitted base, which `values` have as fitted together with the residual.
+        nominal_values: (p,) base and unknown prism offsets as fitted, all others as in the rig file.
         prior, prior_scale: how the build tolerances were used.
-        excess_sigma_mm: what the data scatter beyond station and readings, each axis, at stage effects.
-        base_covariance: (b, b) covariance that the fixes a base was refitted on leave of its parameters, all others
-            being known; part of `covariance`. None where the base was identified along with the others.
-        repeat_sigma_mm: what repeats of a standstill scatter beyond the station's own sigma, each axis.
+        excess_sigma_mm: scatter of the data in excess of station and readings at stage effects, per axis.
+        base_covariance: (b, b) covariance of the parameters of a refitted base given all other parameters; a part of
+            `covariance`. None if the base was identified together with the other parameters.
+        repeat_sigma_mm: scatter of repeats of a standstill in excess of the station's sigma, per axis.
         effects_noise_mm: RMS 3-D noise at stage effects.
-        identifiability: what the data determined.
-        coverage: what they covered.
-        effects: named physics on top of the kinematics.
-        effects_reason: why these, or why none, a clause.
-        joint_error_scale: error that kinematics and effects leave, as `joint_errors.joint_error_scale` finds it.
-        outliers: fixes of the training data that were weighted out, by the numbers that warnings name their rows by.
+        identifiability: which parameters the data determined.
+        coverage: extent of the training data.
+        effects: named physical effects in addition to the kinematics.
+        effects_reason: a clause that explains why there are these effects or none.
+        joint_error_scale: remaining error of kinematics and effects, from `joint_errors.joint_error_scale`.
+        outliers: fixes of the training data that were downweighted, by the row numbers used in warnings.
         residual: the learner that was kept, if any.
-        trials: learners that were compared.
+        trials: results of the learners that were compared.
         residual_reason: why there is a learner or none.
-        intervals: how many formal standard deviations hold 90 % of errors.
-        warnings: about the training data and the fit.
-        fitted_rows: digests of the rows that were fitted (`observations.row_digests`); none of a model from before.
+        intervals: numbers of formal standard deviations that contain 90 % of errors.
+        warnings: warnings about the training data and the fit.
+        fitted_rows: digests of the fitted rows (`observations.row_digests`); empty for older models.
         provenance: data hash, versions, seed, search; text or numbers.
-        prepared: objects made from the model once and kept with it, by their class; see `Predictor.of`.
+        prepared: objects that are made once from the model and kept with it, by class; see `Predictor.of`.
     """
 
     rig: Rig
@@ -157,7 +157,7 @@ class CalibratedModel:
     repeat_sigma_mm: float
     effects_noise_mm: float
     identifiability: Identifiability
-    coverage: Coverage
+    coverage: TrainingExtent
     effects: tuple[FittedEffect, ...] = ()
     effects_reason: str = "switched off"
     joint_error_scale: float = 0.0
@@ -179,12 +179,12 @@ class CalibratedModel:
 
     @property
     def known_noise_mm2(self) -> float:
-        """Mean square 3-D noise of a fix by station, readings and repeats."""
+        """Mean square 3-D noise of a fix due to station, readings and repeats."""
         return max(self.effects_noise_mm**2 - 3.0 * self.excess_sigma_mm**2, 0.0)
 
     @property
     def noise_mm(self) -> float:
-        """RMS 3-D error that the whole model, residual included, leaves of a held-out fix."""
+        """RMS 3-D error of the whole model, including its residual learner, for a held-out fix."""
         if self.residual is None:
             return self.effects_noise_mm
         return math.sqrt(self.known_noise_mm2 + float(self.residual.excess_variance_mm2.sum()))

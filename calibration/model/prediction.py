@@ -1,4 +1,4 @@
-"""Prediction with a calibrated model: its parts prepared once, and one path through them for one row or many."""
+"""Prediction with a calibrated model; its parts are prepared once, and the same code serves one row or many."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from calibration.residual.features import Extractor, Features
 
 OUTLIER_SIGMA = 5.0
 
-_PIECE = 1250  # rows that are worked on at a time
+_PIECE = 1250  # rows that are computed at a time
 
 
 @dataclass(frozen=True)
@@ -33,13 +33,14 @@ class Prediction:
     """Predicted positions with their uncertainty.
 
     Attributes:
-        position_mm: (n, 3) in the station's frame, as its fixes would be, systematic errors of fixes included.
-        formal_mm: (n, 3) standard deviation of a fix about it, propagated: from parameters, readings, timing, station,
-            effects left out for want of a column, and the error that the model leaves.
-        sigma_mm: (n, 3) the same, scaled by what was counted on rows left out of the fit: 90 % of fixes lie within
-            1.645 times it.
-        radius_mm: (n,) a fix is that near with 90 % probability, its 3-D distance.
-        weight: (n,) of the residual learner in each row, 0 to 1; None for a model that has none.
+        position_mm: (n, 3) positions in the station's frame as the station would measure them, including systematic
+            errors of fixes.
+        formal_mm: (n, 3) standard deviation of a fix about its prediction, propagated from parameters, readings,
+            timing, station, effects that are left out because a column is missing, and the error of the model.
+        sigma_mm: (n, 3) the same, calibrated on rows left out of the fit so that 90 % of fixes lie within 1.645 times
+            it.
+        radius_mm: (n,) 3-D distance within which a fix lies with 90 % probability.
+        weight: (n,) weight of the residual learner in each row, 0 to 1; None for a model without a learner.
     """
 
     position_mm: Floats
@@ -50,23 +51,23 @@ class Prediction:
 
     @property
     def half_mm(self) -> Floats:
-        """(n, 3) half widths of 90 % intervals: a fix is that near along each axis."""
+        """(n, 3) half widths of the 90 % intervals of a fix along each axis."""
         return NORMAL * self.sigma_mm
 
     def coverage(self, error_mm: Floats) -> Coverage:
-        """Share of errors (n, 3) that are inside their 90 % intervals."""
+        """Return the share of errors (n, 3) that are inside their 90 % intervals."""
         return coverage(error_mm, self.half_mm, self.radius_mm)
 
 
 @dataclass(frozen=True)
 class _Rows:
-    """n observations as the kinematics take them.
+    """n observations prepared for the kinematics.
 
     Attributes:
-        data: bound, with the joints where the effects have them.
+        data: readings as corrected by the effects, prisms and set-ups.
         context: the observations as read.
         columns: effects per unit of their coefficients.
-        shift_mm: (n, 3) by what the effects move the prisms beside the joints, in the station's frame.
+        shift_mm: (n, 3) displacements of the prisms by effects that do not act through joints, in the station's frame.
     """
 
     data: ChainData
@@ -76,14 +77,14 @@ class _Rows:
 
 
 @dataclass(frozen=True)
-class Parts:
-    """Positions of n rows by the whole model, and their parts; all in the station's frame.
+class PositionParts:
+    """Positions of n rows predicted by the whole model, and their parts; all in the station's frame.
 
     Attributes:
-        position_mm: (n, 3).
-        readings: (n, joints) where the effects have the joints, deg or mm.
-        joint_jacobian: (n, 3, joints) by these, mm per deg or mm, without the correction's part.
-        correction_mm: (n, 3) part by the residual learner.
+        position_mm: (n, 3) positions.
+        readings: (n, joints) joint values as corrected by the effects, deg or mm.
+        joint_jacobian: (n, 3, joints) derivatives by these, mm per deg or mm, without those of the correction.
+        correction_mm: (n, 3) part of the positions due to the residual learner.
     """
 
     position_mm: Floats
@@ -93,11 +94,11 @@ class Parts:
 
 
 class Predictor:
-    """Predictions of a model for observations, its parts prepared once.
+    """Predictions of a model for observations, with the model's parts prepared once.
 
-    `Predictor.of(model)` prepares a model at the first call and keeps the result with it. Unless said otherwise,
+    `Predictor.of(model)` prepares a model at the first call and keeps the result with it. Unless stated otherwise,
     methods raise UnsafeError for observations of a set-up that the model does not know (as `check_setups`), and
-    CalibrationError where a position or its standard deviation is not a finite number.
+    CalibrationError if a position or its standard deviation is not a finite number.
 
     Args:
         model: the model to predict with.
@@ -131,7 +132,7 @@ class Predictor:
         """Predict positions and the standard deviation of a fix about each.
 
         Args:
-            observations: n rows; their positions, if any, are not looked at.
+            observations: n rows; their positions, if any, are ignored.
             executor: threads among which many rows are divided; the result does not depend on it.
         """
         if len(observations) <= _PIECE or self._effects.depends_on_order:
@@ -148,33 +149,33 @@ class Predictor:
         )
 
     def nominal_mm(self, observations: Observations) -> Floats:
-        """(n, 3) positions of the nominal rig, in the station's frame."""
+        """Return (n, 3) positions predicted by the nominal rig, in the station's frame, mm."""
         return self._by_kinematics(self._model.nominal_values, observations)
 
     def geometric_mm(self, observations: Observations) -> Floats:
-        """(n, 3) positions by the kinematics identified without effects, in the station's frame."""
+        """Return (n, 3) positions by the kinematics identified without effects, in the station's frame, mm."""
         return self._by_kinematics(self._model.geometric_values, observations)
 
     def effects_mm(self, observations: Observations) -> Floats:
-        """(n, 3) positions by kinematics and effects, in the station's frame."""
+        """Return (n, 3) positions by kinematics and effects, in the station's frame, mm."""
         rows = self._rows(observations)
         position_mm = self._machine.locate(rows.data).position_mm + rows.shift_mm
         _refuse_infinite(observations, position_mm)
         return position_mm
 
-    def parts(self, observations: Observations) -> Parts:
-        """The whole model without its uncertainty, part by part."""
+    def parts(self, observations: Observations) -> PositionParts:
+        """Predict positions without their uncertainty, and return them with their parts."""
         rows = self._rows(observations)
         located, estimate, _ = self._located(rows)
         rotation = self._machine.rotations(rows.data)
         correction, by_joint = _turned(rotation, estimate), rotation @ located.joint_jacobian
         _refuse_infinite(observations, located.position_mm, correction)
-        return Parts(located.position_mm + rows.shift_mm + correction, rows.data.readings, by_joint, correction)
+        return PositionParts(located.position_mm + rows.shift_mm + correction, rows.data.readings, by_joint, correction)
 
     def base_mm(self, observations: Observations) -> Floats:
-        """(n, 3) places of the prisms in the base frame, by the whole model.
+        """Return (n, 3) positions of the prisms in the base frame predicted by the whole model, mm.
 
-        Effects that change fixes alone (of station, prisms and clocks) or that move the base are no part of them.
+        Effects that change only fixes (those of station, prisms and clocks) or that move the base are excluded.
         """
         rows = self._rows(observations)
         located, estimate, _ = self._located(rows)
@@ -186,15 +187,15 @@ class Predictor:
         return place_mm
 
     def to_station(self, observations: Observations, vector_mm: Floats) -> Floats:
-        """(n, 3) vectors of the base frame turned into the station's."""
+        """Rotate (n, 3) vectors from the base frame to the station's frame."""
         return _turned(self._machine.rotations(self._chain.bind(observations)), vector_mm)
 
     def to_base(self, observations: Observations, vector_mm: Floats) -> Floats:
-        """(n, 3) vectors of the station's frame turned into the base frame."""
+        """Rotate (n, 3) vectors from the station's frame to the base frame."""
         return _turned(self._machine.rotations(self._chain.bind(observations)).transpose(0, 2, 1), vector_mm)
 
     def corrected(self, observations: Observations) -> Observations:
-        """The observations with the joints where the effects have them, and not where they read."""
+        """Return the observations with their joint readings corrected by the effects."""
         if not self._model.effects:
             return observations
         columns = self._effects.columns(self.context(observations))
@@ -202,10 +203,11 @@ class Predictor:
         return corrected(observations, change, self._model.rig.joint_names)
 
     def correction(self, observations: Observations) -> tuple[Floats, Floats]:
-        """Correction by the residual learner, zero for prisms it was not trained on; both in the station's frame.
+        """Compute the correction by the residual learner, zero for prisms on which it was not trained.
 
         Returns:
-            (n, 3) correction, mm; (n, 3, 3) covariance of the errors that the model leaves even so, mm^2.
+            (n, 3) correction, mm, and (n, 3, 3) covariance of the remaining errors of the model, mm^2, both in the
+            station's frame.
         """
         rows = self._rows(observations)
         rotation = self._machine.rotations(rows.data)
@@ -215,7 +217,7 @@ class Predictor:
         return _turned(rotation, estimate), (rotation * excess[:, None, :]) @ rotation.transpose(0, 2, 1)
 
     def features(self, observations: Observations, signals: Sequence[str]) -> Features:
-        """Features of a residual learner with these signal columns, effects taken into account."""
+        """Compute the features of a residual learner with these signal columns, after correction by the effects."""
         rows = self._rows(observations)
         located = self._linearise(rows)
         residual = self._model.residual
@@ -224,7 +226,7 @@ class Predictor:
         return extract(rows.data.readings, located, observations.extra)
 
     def linearise(self, observations: Observations) -> Linearisation:
-        """Positions by kinematics and effects with their derivatives; the Jacobian by parameters and coefficients."""
+        """Compute positions by kinematics and effects, with derivatives by parameters, coefficients and readings."""
         rows = self._rows(observations)
         located = self._linearise(rows)
         rotation = self._machine.rotations(rows.data)
@@ -233,10 +235,10 @@ class Predictor:
         )
 
     def deviations(self, observations: Observations) -> Floats:
-        """(n,) errors of kinematics and effects in sigma (Mahalanobis length).
+        """Return the (n,) errors of kinematics and effects in sigma (Mahalanobis length).
 
         Raises:
-            CalibrationError: an uncertainty that is no machine's.
+            CalibrationError: the uncertainty of a position is too large for any machine.
         """
         position, known, parameters = self._covariances(observations)
         error = observations.position_mm - position
@@ -250,22 +252,22 @@ class Predictor:
         return np.asarray(np.linalg.norm(whitened, axis=1), dtype=np.float64)
 
     def find_outliers(self, observations: Observations) -> tuple[Outlier, ...]:
-        """Fixes farther from kinematics and effects than noise and parameters explain."""
+        """Return the fixes farther from kinematics and effects than noise and parameters explain."""
         size = self.deviations(observations)
         return tuple(Outlier(int(row), float(size[row])) for row in np.flatnonzero(size > OUTLIER_SIGMA))
 
     def unexplained_mm2(self, observations: Observations, variance_mm2: Floats) -> Floats:
-        """Mean squared errors of a learner less the known noise.
+        """Return the mean squared errors of a learner minus the known noise.
 
-        The training rows' errors are those of kinematics that were fitted to them, smaller by the parameters' share
-        than what new rows see; predictions add that share.
+        As the kinematics were fitted to the training rows, their errors are smaller than those of new rows by the
+        share of the parameters. Predictions add that share.
 
         Args:
             observations: the training rows.
-            variance_mm2: (3,) squared errors on them, along the axes of the base frame.
+            variance_mm2: (3,) mean squared errors on these, along the axes of the base frame.
 
         Returns:
-            (3,) along the same axes, not negative.
+            (3,) variances along the same axes, not negative.
         """
         _, known, parameters = self._covariances(observations)
         rotation = self._machine.rotations(self._chain.bind(observations))
@@ -275,22 +277,22 @@ class Predictor:
         return left
 
     def unknown_variance(self, observations: Observations) -> Floats:
-        """(n, joints) variance of the joints' values by effects left out for want of a column, deg^2 or mm^2."""
+        """Return the (n, joints) variance of joint values due to effects that lack a column, deg^2 or mm^2."""
         return self._effects.unknown_variance(self.context(observations))
 
     def context(self, observations: Observations) -> EffectContext:
-        """The observations as effects see them; of any set-up."""
+        """Return the observations as a context for effects; they may be of any set-up."""
         return EffectContext(self._chain, self._model.values, observations, self._loads, self._machine)
 
     def _by_kinematics(self, values: Floats, observations: Observations) -> Floats:
-        """(n, 3) positions by parameters (p,) without effects."""
+        """Return (n, 3) positions by parameters (p,) without effects."""
         check_setups(self._model, observations)
         return CompiledChain(self._chain, values).locate(self._chain.bind(observations)).position_mm
 
     def _random_share(self, variance_mm2: float) -> float:
-        """Share of the parameters' covariance that noise makes, and not what a learner corrects.
+        """Return the share of the parameters' covariance that is due to noise and not corrected by a learner.
 
-        The learner is trained on what these very parameters leave, and makes good what structure did to them.
+        The learner is trained on the residuals of these parameters, so it corrects their errors from systematic causes.
         """
         return min(1.0, variance_mm2 / max(self._model.effects_noise_mm**2, 1e-12))
 
@@ -325,7 +327,7 @@ class Predictor:
         )
 
     def _covariances(self, observations: Observations) -> tuple[Floats, Floats, Floats]:
-        """(n, 3) positions of stage effects; (n, 3, 3) covariance of a fix, and that by parameters and coefficients."""
+        """Return positions (n, 3) at stage effects, and covariances (n, 3, 3) of a fix and of the parameters' part."""
         rows = self._rows(observations)
         located, of_fix, of_parameters = self._spread(rows, jacobian=False)
         return located.position_mm + rows.shift_mm, of_fix, of_parameters
@@ -338,7 +340,7 @@ class Predictor:
         return _Rows(data, context, columns, shift_mm)
 
     def _located(self, rows: _Rows) -> tuple[Located, Floats, Floats]:
-        """Positions by the kinematics, with the residual learner's estimate and weight as `_learned` gives them."""
+        """Return positions by the kinematics, and the residual learner's estimate and weight as `_learned`."""
         located = self._machine.locate(rows.data) if self._model.residual is None else self._linearise(rows)
         return located, *self._learned(rows, located)
 
@@ -346,7 +348,7 @@ class Predictor:
         return self._machine.linearise(rows.data, rows.columns.column, self._shift_in_base(rows))
 
     def _shift_in_base(self, rows: _Rows) -> Floats | None:
-        """(n, 3, k) displacements by unit coefficients in the base frame."""
+        """Return (n, 3, k) displacements by unit coefficients in the base frame."""
         shift_mm = rows.columns.shift_mm
         return None if shift_mm is None else self._machine.rotations(rows.data).transpose(0, 2, 1) @ shift_mm
 
@@ -372,7 +374,7 @@ class Predictor:
         return located, of_fix, of_parameters
 
     def _by_refitted_base(self, rows: _Rows, located: Located) -> Floats:
-        """(n, 3) variance by a refitted base, known from few fixes; no learner makes it good."""
+        """Return the (n, 3) variance due to a refitted base, which is known from few fixes; no learner corrects it."""
         if self._model.residual is None or self._model.base_covariance is None:
             return np.zeros((len(rows.data), 3))
         base = slice(self._chain.base_start, len(self._chain))
@@ -381,7 +383,7 @@ class Predictor:
         return variance
 
     def _learned(self, rows: _Rows, located: Located) -> tuple[Floats, Floats]:
-        """(n, 3) estimate of the residual learner in the base frame, mm; (n,) its weight, 0 to 1."""
+        """Return the (n, 3) estimate of the residual learner in the base frame, mm, and its (n,) weight, 0 to 1."""
         residual, data = self._model.residual, rows.data
         if residual is None:
             return np.zeros((len(data), 3)), np.zeros(len(data))
@@ -390,7 +392,7 @@ class Predictor:
 
 
 def check_setups(model: CalibratedModel, observations: Observations) -> None:
-    """Raise UnsafeError where the observations come from a set-up that the model does not know."""
+    """Raise UnsafeError if the observations come from a set-up that the model does not know."""
     unknown = sorted(set(observations.setup.tolist()) - set(model.placements))
     if unknown:
         known = ", ".join(repr(s) for s in sorted(model.placements))
@@ -402,18 +404,18 @@ def check_setups(model: CalibratedModel, observations: Observations) -> None:
 
 
 def _refuse_infinite(observations: Observations, *numbers: Floats) -> None:
-    """Raise CalibrationError where one of the arrays (n, 3) of predictions is not finite."""
+    """Raise CalibrationError if one of the arrays (n, 3) of predictions is not finite."""
     for predicted in numbers:
-        # One sum costs less than a look at each, and hides neither infinity nor NaN.
+        # One sum costs less than checking each element, and shows both infinity and NaN.
         if not math.isfinite(predicted.sum()):
             row = int(np.argmin(np.isfinite(predicted).all(axis=1)))
             raise CalibrationError(
-                f"the prediction of {observations.row_name(row)} is not a finite number; look for a reading or signal "
-                f"of that row that no machine can have, else calibrate again"
+                f"the prediction of {observations.row_name(row)} is not a finite number; check that row for an "
+                f"impossible reading or signal, else calibrate again"
             )
 
 
 def _turned(rotation: Floats, vector: Floats) -> Floats:
-    """(n, 3) vectors (n, 3), each turned by its rotation (n, 3, 3)."""
+    """Return vectors (n, 3), each turned by its rotation (n, 3, 3)."""
     turned: Floats = (rotation @ vector[:, :, None])[:, :, 0]
     return turned

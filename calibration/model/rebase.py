@@ -1,4 +1,4 @@
-"""A calibrated model at another set-up: the rigid base transform refitted, all else kept."""
+"""Use of a calibrated model at a new set-up: the rigid base transform is refitted, everything else is kept."""
 
 from __future__ import annotations
 
@@ -19,29 +19,29 @@ from calibration.model.model import CalibratedModel
 from calibration.model.prediction import Predictor
 from calibration.observations import Floats, Observations
 
-_REACHED = 0.5  # weight of the residual in a row, beyond which the row lies in its region
-_ROUNDS = 2  # the residual turns with the base: after the first by a few mrad, then by nothing that is seen
+_REACHED = 0.5  # weight of the residual in a row, above which the row counts as inside its region
+_ROUNDS = 2  # the residual turns with the base: a few mrad after the first round, then negligibly
 
 
 def with_refitted_base(model: CalibratedModel, observations: Observations) -> CalibratedModel:
     """Refit the base transform of a model at the set-ups of some observations.
 
-    A base is fitted to the errors of the whole model, its residual included: one fitted without would take up the
-    residual's estimate at these few places, and a prediction would add that a second time. The residual is left out of
-    the model where at most half of these fixes lie in the region it was trained on, or where they fit better without
-    it: what was learned at home is then not true here, and the few rows that it reaches would bend the base for all.
+    The base is fitted with the whole model, including its residual. A base fitted without the residual would absorb the
+    residual's estimate at these few places, and a prediction would add it a second time. The residual is removed from
+    the model if no more than half of these fixes lie inside its region, or if the fixes fit better without it. In these
+    cases it is not valid at these set-ups, and the few rows that it affects would distort the base for all.
 
     Args:
         model: the model.
         observations: n rows with positions, at one or more set-ups.
 
     Returns:
-        The model with these set-ups in place of its own; without its residual, and with the reason, where that is left
-        out. Its intervals are those of its training, x and y alike: `SetupErrors` widens them by what is seen here.
+        The model with these set-ups instead of its own. If the residual was removed, it contains the reason. Its
+        intervals are those from its training, averaged over x and y; `SetupErrors` widens them by the errors seen here.
 
     Raises:
         DataError: a prism that the rig lacks.
-        UnsafeError: fewer than three fixes of a set-up, all on a line or in one place, or mirrored.
+        UnsafeError: a set-up has fewer than three fixes, all on a line or in one place, or mirrored.
     """
     setups = sorted(set(observations.setup.tolist()))
     blank = Chain(model.rig, {setup: Placement.identity() for setup in setups})
@@ -56,13 +56,13 @@ def with_refitted_base(model: CalibratedModel, observations: Observations) -> Ca
     free = np.arange(len(chain)) >= body
     context = EffectContext(chain, extended(model.values), observations)
     model = replace(model, effects=tuple(effect.at_new_setups(context) for effect in model.effects))
-    additions = fitted_columns(model.effects, context)
-    additions = additions.over(samples.average)
-    moves = np.concatenate([free, np.zeros(len(additions), dtype=bool)])
+    effect_columns = fitted_columns(model.effects, context)
+    effect_columns = effect_columns.over(samples.average)
+    moves = np.concatenate([free, np.zeros(len(effect_columns), dtype=bool)])
     begun = np.concatenate([extended(model.values), coefficient_values(model.effects)])
-    # First with the noise of a rough start: beside that of the model, all fixes would look like outliers.
-    near = refine(chain, samples, begun, free=moves, additions=additions)
-    fit = refine(chain, samples, near.x, free=moves, excess_variance=model.excess_sigma_mm**2, additions=additions)
+    # First with the noise of a rough start; with the model's noise all fixes would look like outliers.
+    near = refine(chain, samples, begun, free=moves, additions=effect_columns)
+    fit = refine(chain, samples, near.x, free=moves, excess_variance=model.excess_sigma_mm**2, additions=effect_columns)
     effects_values = fit.x[: len(chain)]
     refuse_turning(chain, samples, effects_values)
     left, without = samples, fit
@@ -74,7 +74,7 @@ def with_refitted_base(model: CalibratedModel, observations: Observations) -> Ca
             position_mm=samples.position_mm - samples.average(correction),
             station_covariance=samples.station_covariance + samples.average(lacking),
         )
-        fit = refine(chain, left, fit.x, free=moves, excess_variance=0.0, additions=additions)
+        fit = refine(chain, left, fit.x, free=moves, excess_variance=0.0, additions=effect_columns)
     if model.residual is not None:
         placed = replace(model, placements=start.placements)
         reason = _why_left_out(
@@ -95,7 +95,7 @@ def with_refitted_base(model: CalibratedModel, observations: Observations) -> Ca
         model,
         placements=start.placements,
         values=fit.x[: len(chain)],
-        covariance=_covariance(chain, left, fit, additions, model.covariance[np.ix_(known, known)]),
+        covariance=_covariance(chain, left, fit, effect_columns, model.covariance[np.ix_(known, known)]),
         base_covariance=fit.covariance[body : len(chain), body : len(chain)],
         geometric_values=geometric,
         nominal_values=nominal.x,
@@ -104,33 +104,35 @@ def with_refitted_base(model: CalibratedModel, observations: Observations) -> Ca
 
 
 def _why_left_out(without: CalibratedModel, whole: CalibratedModel, observations: Observations) -> str:
-    """Return why the residual is left out at these set-ups; empty where it is of use."""
+    """Return the reason for leaving out the residual at these set-ups; empty if it helps there."""
     prediction = Predictor.of(whole).predict(observations)
     assert prediction.weight is not None
     reached = prediction.weight > _REACHED
     if 2 * int(reached.sum()) <= len(reached):
         return (
-            f"{int((~reached).sum())} of {len(reached)} fixes lie outside the region that the residual was trained on"
+            f"{int((~reached).sum())} of {len(reached)} fixes lie outside the region in which the residual was trained"
         )
     before, after = (
         float(np.median(np.linalg.norm(observations.position_mm - position_mm, axis=1)))
         for position_mm in (Predictor.of(without).effects_mm(observations), prediction.position_mm)
     )
     if after > before:
-        return f"the fixes are {after:.3g} mm off with the residual and {before:.3g} mm without, in the median"
+        return f"the median error of the fixes is {after:.3g} mm with the residual and {before:.3g} mm without it"
     return ""
 
 
-def _covariance(chain: Chain, samples: Samples, fit: Fit, additions: EffectColumns, known_covariance: Floats) -> Floats:
-    """(p + k, p + k) covariance when the base is fitted for given parameters of the body and coefficients.
+def _covariance(
+    chain: Chain, samples: Samples, fit: Fit, effect_columns: EffectColumns, known_covariance: Floats
+) -> Floats:
+    """Return the (p + k, p + k) covariance when the base is fitted with all other parameters and coefficients known.
 
-    Much of their uncertainty is of directions that a base transform undoes; the new base undoes them as the old one
-    did, so its estimate is correlated with them: d base / d known = -H_bb^-1 H_bk.
+    Much of the uncertainty of the other parameters is in directions that a base transform compensates. The new base
+    compensates them as the old one did, so its estimate is correlated with them: d base / d known = -H_bb^-1 H_bk.
     """
     base = np.zeros(len(fit.x), dtype=bool)
     base[chain.base_start : len(chain)] = True
     seen = information(
-        chain, samples, fit.x, excess_variance=fit.excess_variance, weight=fit.weight, additions=additions
+        chain, samples, fit.x, excess_variance=fit.excess_variance, weight=fit.weight, additions=effect_columns
     )
     own = fit.covariance[np.ix_(base, base)]
     follows = -own @ seen[np.ix_(base, ~base)]

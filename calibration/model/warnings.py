@@ -1,4 +1,4 @@
-"""Warnings about using a model for observations unlike those it was trained on."""
+"""Warnings about using a model for observations that differ from its training data."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ _OUTSIDE = 0.1  # of a trained range
 _OUTSIDE_DEG = 1.0  # at least
 _OUTSIDE_MM = 10.0
 _OUTSIDE_KG = 1.0
-_OUTSIDE_LOAD = 0.25  # of a trained range: its ends are rarer poses than those of a joint's
+_OUTSIDE_LOAD = 0.25  # of a trained range, whose ends are reached in fewer poses than those of a joint's range
 _UNITS = {"kN m": 1e-3, "kgf m": 1.0 / 9.80665, "N mm": 1e3}
-_ALIKE = 0.7  # correlation about zero; less says nothing of a factor
-_FAR = 5.0  # times: masses are not wrong by so much
-_NEAR = 2.0  # times a unit: that unit
+_ALIKE = 0.7  # correlation about zero, below which a factor is meaningless
+_FAR = 5.0  # factor that wrong masses cannot explain
+_NEAR = 2.0  # greatest ratio between a factor and the unit that explains it
 _LEAST_ROWS = 10
-_LEAST_LOAD = 0.01  # of the largest load of any joint: less is nothing to compare with
-_SIGMAS = 3.0  # standard errors that a factor must have
+_LEAST_LOAD = 0.01  # of the largest load of any joint; smaller loads are not compared
+_SIGMAS = 3.0  # least size of a factor, in standard errors
 _LISTED = 5  # rows
 
 
 def model_warnings(model: CalibratedModel, observations: Observations) -> tuple[str, ...]:
-    """Warn of using the model for observations unlike those it was trained on, one sentence each.
+    """Return warnings about using the model for observations that differ from its training data, one sentence each.
 
     The observations may be of any set-up.
     """
@@ -70,7 +70,7 @@ def _of_readings(model: CalibratedModel, observations: Observations) -> Iterator
 
 
 def _of_torques(model: CalibratedModel, context: EffectContext) -> Iterator[str]:
-    """Warn of torques unlike those of training: computed where they were measured, of another sign or beyond."""
+    """Yield warnings about torques that differ from training: computed or measured, in their sign, or out of range."""
     turning = {joint.name for joint in model.rig.joints if joint.kind == "revolute"}
     used = _loads_by_name(model) & turning
     for name in sorted(used):
@@ -78,7 +78,7 @@ def _of_torques(model: CalibratedModel, context: EffectContext) -> Iterator[str]
         if before and not now and model.rig.masses:
             yield (
                 f"the torque of {name} was measured in training ({name}_Nm), which this data lacks: it is computed "
-                f"from the rig file's masses, whose error is in no standard deviation"
+                f"from the rig file's masses, whose error is not in any standard deviation"
             )
         elif now and not before:
             yield (
@@ -91,19 +91,19 @@ def _of_torques(model: CalibratedModel, context: EffectContext) -> Iterator[str]
         name, value = effect.where, effect.coefficients[0].value
         is_learned_from_it = effect.family == "joint_compliance" and name in model.coverage.torques
         if is_learned_from_it and times.get(name, 0.0) * value < 0.0:
-            yield f"{name}_Nm has the other sign than in training, where {effect.family}@{name} was learned from it"
+            yield f"{name}_Nm has the opposite sign to training, where {effect.family}@{name} was fitted to it"
     for name, (low, high) in model.coverage.loads.items():
         load, margin = context.torque(name), _OUTSIDE_LOAD * (high - low)
         outside = int(((load < low - margin) | (load > high + margin)).sum())
         if outside:
             yield (
                 f"the load on {name} is outside the {low:.0f} .. {high:.0f} N m of the training data in {outside} of "
-                f"{len(load)} rows: what it does there was never seen"
+                f"{len(load)} rows: its effect there is unknown"
             )
 
 
 def _of_payload(model: CalibratedModel, context: EffectContext) -> Iterator[str]:
-    """Warn of payloads that training did not have, in rows where a load in use is computed from them."""
+    """Yield warnings about payloads outside the training data, in rows where a load in use is computed from them."""
     carried, used = [mass.kg for mass in model.rig.masses if mass.payload], sorted(_loads_used(model))
     weighs = any(library()[effect.family].load_kind == "weights" for effect in model.effects)
     if not carried or not (used or weighs):
@@ -111,29 +111,29 @@ def _of_payload(model: CalibratedModel, context: EffectContext) -> Iterator[str]
     measured = [np.isfinite(context.extra(f"{name}_Nm")) for name in used]
     computed = np.full(len(context), weighs) | ~np.all(measured or [np.ones(len(context), dtype=bool)], axis=0)
     payload = context.extra("payload_kg")
-    # Where training had none, the rig file's payload was taken.
+    # Training data without a payload used that of the rig file.
     low, high = model.coverage.payload or (min(carried), max(carried))
     margin = max(_OUTSIDE * (high - low), _OUTSIDE_KG)
     outside = int((computed & ((payload < low - margin) | (payload > high + margin))).sum())
     if outside:
         yield (
             f"payload_kg: {outside} of {len(payload)} rows are outside the {low:g} .. {high:g} kg of the training "
-            f"data; the loads that effects and residual use are beyond what was seen"
+            f"data; the loads that effects and residual use are beyond those in training"
         )
     missing = int((computed & np.isnan(payload)).sum())
     if missing and model.coverage.payload is not None:
-        yield f"payload_kg is missing in {missing} of {len(payload)} rows: the rig file's payload is taken there"
+        yield f"payload_kg is missing in {missing} of {len(payload)} rows: the rig file's payload is used there"
 
 
 def _loads_used(model: CalibratedModel) -> set[str]:
-    """Joints whose load effects or the residual use."""
+    """Return the joints whose loads are used by effects or the residual."""
     if model.residual is not None and not set(DEFLECTION).isdisjoint(model.residual.signals):
         return set(model.rig.joint_names)
     return _loads_by_name(model)
 
 
 def _loads_by_name(model: CalibratedModel) -> set[str]:
-    """Joints whose own load effects or the residual use."""
+    """Return the joints whose own load is used by effects or the residual."""
     learned = model.residual.signals if model.residual is not None else ()
     columns = zip(model.rig.joint_names, torque_columns(model.rig), strict=True)
     used = {e.where for e in model.effects if library()[e.family].load_kind == "torque"}
@@ -156,7 +156,7 @@ def _of_residual(model: CalibratedModel, observations: Observations) -> Iterator
 
 
 def farthest(observations: Observations, outliers: Sequence[Outlier]) -> str:
-    """Return a clause on outliers, of which there are some: how far off they are, and where the farthest were read."""
+    """Return a clause that describes one or more outliers: their size, and the rows of the farthest."""
     worst = sorted(outliers, key=lambda outlier: -outlier.sigma)
     rows = observations.row_name(*(outlier.row for outlier in worst[:_LISTED]))
     more = f" and {len(worst) - _LISTED} more" if len(worst) > _LISTED else ""
@@ -164,11 +164,11 @@ def farthest(observations: Observations, outliers: Sequence[Outlier]) -> str:
 
 
 def times_computed(context: EffectContext) -> Mapping[str, float]:
-    """Compare measured torques with the loads that the rig file's masses make.
+    """Compare measured torques with the loads that are computed from the rig file's masses.
 
     Returns:
-        Joint -> factor from its load to its column `<name>_Nm`, for joints that have a load to compare with and where
-        the factor is beyond three standard errors.
+        Joint -> ratio of its column `<name>_Nm` to its load, for joints with a sufficient load and a ratio of more than
+        three standard errors.
     """
     rows = context.observations
     extra = {name: values for name, values in rows.extra.items() if not name.endswith("_Nm")}
@@ -198,7 +198,7 @@ def _rms(values: Floats) -> float:
 
 
 def torque_unit_warnings(times_computed: Mapping[str, float]) -> Iterator[str]:
-    """Warn of columns `<name>_Nm` that seem to be in another unit than N m, one sentence a unit."""
+    """Yield warnings about columns `<name>_Nm` that seem not to be in N m, one sentence for each unit."""
     columns: dict[str, list[str]] = {}
     for name, times in times_computed.items():
         if not 1.0 / _FAR < abs(times) < _FAR:
@@ -206,6 +206,6 @@ def torque_unit_warnings(times_computed: Mapping[str, float]) -> Iterator[str]:
             columns.setdefault(unit, []).append(f"{name}_Nm ({abs(times):.2g} times)")
     for unit, strange in columns.items():
         yield (
-            f"measured torques are far from the loads that the rig file's masses make, as if in {unit} or of another "
+            f"measured torques differ by far from the loads of the rig file's masses, as if in {unit} or of another "
             f"shaft: {', '.join(strange)}; convert them to N m at the joint"
         )

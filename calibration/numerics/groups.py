@@ -1,8 +1,8 @@
-"""Groups of poses that grouped splits hold out whole: stretches of a path, told apart from independent poses.
+"""Groups of poses that are held out together: stretches of a path, as opposed to independent poses.
 
-Neighbours along a path have nearly the same pose and nearly the same error, whichever cell of the workspace each of
-them is in. Held out row by row, or in cells of a few rows, they say how well a model interpolates and nothing of what
-it makes of poses that it has not seen.
+Neighbours along a path have nearly the same pose and nearly the same error, even in different cells of the workspace.
+If they are held out row by row, or in cells of a few rows, they show how well a model interpolates but not its accuracy
+at new poses.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from calibration.observations import Floats
 Integers = NDArray[np.intp]
 
 _LEAST_POSES = 40
-_SMOOTH = 0.3  # median cosine between one step and the next; random poses have -0.5 or less
-_NEIGHBOURS = 0.9  # least autocorrelation from one pose to the next; a coarse grid measured line by line has less
+_SMOOTH = 0.3  # least median cosine between consecutive steps; random poses have -0.5 or less
+_NEIGHBOURS = 0.9  # least autocorrelation of consecutive poses; a coarse grid measured line by line has less
 _RELATED = 0.5  # autocorrelation of the poses at which a stretch ends
 _LEAST_STRETCHES = 20
-_STILL = 0.02  # of the greatest spread among joints of one unit, below which a joint stands
+_STILL = 0.02  # of the greatest spread among joints, below which a joint counts as not moving
 
 
 def same_readings(readings: Floats, track: Integers) -> Integers:
@@ -37,15 +37,15 @@ def same_readings(readings: Floats, track: Integers) -> Integers:
 
 
 def path_stretches(readings: Floats, track: Integers) -> Integers | None:
-    """Return (n,) numbers of the stretches of a path, or None where the poses do not follow one.
+    """Return (n,) numbers of the stretches of a path, or None if the poses do not follow one.
 
-    Rows follow a path if the next step mostly goes on in the direction of the last one, and neighbours have nearly the
-    same pose. A stretch is as long as that resemblance lasts, unless fewer than some twenty stretches would
-    be left. Where the path returns to a place, its rows belong to the stretch that was there first.
+    Rows follow a path if steps mostly continue in the direction of the step before, and neighbours have nearly the same
+    pose. The length of a stretch is the correlation length of the poses, limited so that there are at least about
+    twenty stretches. Where the path returns to a place, its rows belong to the first stretch there.
 
     Args:
         readings: (n, joints) deg or mm, in the order in which they were measured.
-        track: (n,) rows of one set-up and session have the same number; no path leads from one to another.
+        track: (n,) rows of one set-up and session have the same number; paths do not cross between tracks.
     """
     if len(readings) < _LEAST_POSES:
         return None
@@ -54,7 +54,7 @@ def path_stretches(readings: Floats, track: Integers) -> Integers | None:
     if not moving.any():
         return None
     scaled = readings[:, moving] / spread[moving]
-    # Prisms seen one after the other from one standstill are one pose of the path.
+    # Prisms measured one after the other in one standstill are one pose of the path.
     new = np.ones(len(scaled), dtype=bool)
     new[1:] = (track[1:] != track[:-1]) | (scaled[1:] != scaled[:-1]).any(axis=1)
     poses, of_track = scaled[new], track[new]
@@ -67,7 +67,7 @@ def path_stretches(readings: Floats, track: Integers) -> Integers | None:
 
 
 def _median_cosine(poses: Floats, track: Integers) -> float:
-    """Median cosine between each step and the one before it, within a track."""
+    """Return the median cosine between each step and the one before it, within a track."""
     step = np.diff(poses, axis=0)
     whole = (track[2:] == track[1:-1]) & (track[1:-1] == track[:-2])
     size = np.linalg.norm(step, axis=1)
@@ -79,7 +79,7 @@ def _median_cosine(poses: Floats, track: Integers) -> float:
 
 
 def _autocorrelation(poses: Floats, track: Integers, lag: int) -> float:
-    """Mean over the joints, each with a variance of 1; of poses of one track."""
+    """Return the mean autocorrelation over the joints, each with a variance of 1, of poses within a track."""
     together = track[lag:] == track[:-lag]
     if not together.any():
         return 0.0
@@ -93,9 +93,9 @@ def _correlation_length(poses: Floats, track: Integers) -> int:
 
 
 def _leaders(poses: Floats, length: int) -> Floats:
-    """Poses in the middles of the stretches, less those that lie in a stretch that is there already."""
+    """Return the poses in the middle of each stretch, without those inside an earlier stretch."""
     middles = poses[length // 2 :: length]
-    # Half the usual way from one middle to the next.
+    # Half the usual distance between consecutive middles.
     reach = 0.5 * float(np.median(np.linalg.norm(np.diff(middles, axis=0), axis=1)))
     kept: list[Floats] = []
     for middle in middles:

@@ -1,8 +1,8 @@
-"""Compilation of numerical loops by numba, without the interpreter's lock, and kept on disk where possible.
+"""Compilation of numerical loops by numba, without the interpreter's lock, and cached on disk where possible.
 
-numba renews what it keeps when the file of the compiled function changes, but not when another file does whose
-functions or constants were compiled into it. Installing renews all files; who works on the sources gives each state of
-them a cache of its own, as the Makefile does.
+numba recompiles a function when its own file changes, but not when a different file changes whose functions or
+constants were compiled into it. An installation renews all files. Developers need a separate cache for each state of
+the sources, as the Makefile provides.
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ import numba
 
 _F = TypeVar("_F", bound=Callable[..., Any])
 
-_FASTMATH = {"reassoc", "contract", "arcp", "nsz"}  # not nnan: what overflows must stay visible
+_FASTMATH = {"reassoc", "contract", "arcp", "nsz"}  # not nnan, so that overflows remain visible
 
 
 def compiled(function: _F) -> _F:
-    """Compile a function on its first call; keep it on disk if numba finds a writable place, else in memory.
+    """Compile a function on its first call; cache it on disk if numba finds a writable place, else in memory.
 
     Args:
-        function: loops over arrays, in the part of Python that numba compiles.
+        function: loops over arrays, in the subset of Python that numba supports.
     """
     try:
         return cast("_F", numba.njit(nogil=True, fastmath=_FASTMATH, error_model="numpy", cache=True)(function))
@@ -30,10 +30,10 @@ def compiled(function: _F) -> _F:
 
 
 def part(*fastmath: str) -> Callable[[_F], _F]:
-    """Return a decorator for parts of compiled functions: without the wrappers that Python would call them by.
+    """Return a decorator for parts of compiled functions, which have no wrappers for calls from Python.
 
     Args:
-        fastmath: LLVM's flags for its arithmetic, in place of the usual ones.
+        fastmath: LLVM's fast-math flags, in place of the default ones.
     """
     options: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
     return cast(
@@ -43,12 +43,12 @@ def part(*fastmath: str) -> Callable[[_F], _F]:
 
 
 def inlined(function: _F) -> _F:
-    """Compile a step into each of the compiled loops that call it.
+    """Compile a function inline into each of the compiled loops that call it.
 
-    The calls of a walk over a chain, with the dozen arrays that each is handed, cost a fifth of its time.
+    Calls with a dozen array arguments would cost a fifth of the time of a walk over a chain.
 
     Args:
-        function: a step of compiled loops; Python does not call it.
+        function: a step of compiled loops, not called from Python.
     """
     options: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True, "inline": "always"}
     return cast("_F", numba.njit(nogil=True, fastmath=_FASTMATH, error_model="numpy", **options)(function))

@@ -1,7 +1,7 @@
 """Products of columns that are mostly zero, inverses by Cholesky factors, and roots of covariances.
 
-A curve of a joint's angle has dozens of splines, and a fix touches four of them: of the hundreds of coefficients of
-several curves a row has a few. What each row has it adds, so zeros cost no more than a look.
+A curve over a joint's angle has dozens of splines, of which four are not zero at a fix. So a row has only a few of the
+hundreds of coefficients of several curves. Products are summed over the nonzero values of each row.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ from calibration.observations import Floats
 
 Integers = NDArray[np.intp]
 
-_RARE = 0.25  # share of the rows that have anything in a rare column, at most
-_WORTHWHILE = 50  # rare columns: with fewer, products of all columns are as fast
+_RARE = 0.25  # greatest share of nonzero rows in a rare column
+_WORTHWHILE = 50  # rare columns; with fewer, products of all columns are as fast
 
 
 def gram(rows: Floats) -> Floats:
-    """Return the (q, q) products of all columns of `rows` (r, q) with each other: rows' rows."""
+    """Return the (q, q) products rows' rows of all columns of `rows` (r, q) with each other."""
     rare = _filled(np.ascontiguousarray(rows)) <= _RARE * len(rows)
     if rare.sum() < _WORTHWHILE:
         product: Floats = rows.T @ rows
@@ -35,7 +35,7 @@ def gram(rows: Floats) -> Floats:
 
 @compiled
 def _place(often: Integers, seldom: Integers, usual: Floats, beside: Floats, own: Floats, out: Floats) -> None:
-    """Write products of the columns `often` (p,), `seldom` (s,) and of both into `out` (q, q).
+    """Write the products within and between the columns `often` (p,) and `seldom` (s,) into `out` (q, q).
 
     `usual` is (p, p), `beside` (s, p); of `own` (s, s) only the lower triangle is filled.
     """
@@ -53,7 +53,7 @@ def _place(often: Integers, seldom: Integers, usual: Floats, beside: Floats, own
 
 @compiled
 def _filled(rows: Floats) -> Integers:
-    """(q,) number of values of each column of rows (r, q) that are not zero."""
+    """Return the (q,) number of nonzero values in each column of rows (r, q)."""
     out = np.zeros(rows.shape[1], dtype=np.intp)
     for r in range(len(rows)):
         for k in range(rows.shape[1]):
@@ -63,7 +63,7 @@ def _filled(rows: Floats) -> Integers:
 
 @compiled
 def _add(rows: Floats, seldom: Integers, often: Integers, beside: Floats, own: Floats) -> None:
-    """Add the products of the columns `seldom` (s,) of rows (r, q) with those `often` (p,) and with each other.
+    """Add the products of the columns `seldom` (s,) of rows (r, q) with the columns `often` (p,) and with each other.
 
     `beside` is (s, p); of `own` (s, s) only the lower triangle is filled.
     """
@@ -84,7 +84,7 @@ def _add(rows: Floats, seldom: Integers, often: Integers, beside: Floats, own: F
 
 
 def inverse_by(factor: Floats) -> Floats:
-    """Return the inverse (q, q) of the matrix whose lower Cholesky factor is given, whatever stands above."""
+    """Return the inverse (q, q) of the matrix with a lower Cholesky factor, whose upper triangle is ignored."""
     if not len(factor):
         return factor
     lower = np.tril(lapack.dpotri(factor, lower=1)[0])

@@ -1,7 +1,7 @@
-"""One BLAS thread for each call, wherever it runs.
+"""Limit of one BLAS thread for each call, in any executor.
 
-BLAS threads under worker threads wait for each other in busy loops (several times slower on two cores), and other
-numbers of them make other sums: a result would depend on the machine, and on the executor.
+BLAS threads started by worker threads wait for each other in busy loops, which is several times slower on two cores.
+The order of summation also depends on their number, so results would depend on the machine and on the executor.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ from threadpoolctl import threadpool_limits
 P = ParamSpec("P")
 T = TypeVar("T")
 
-# The limit is the process's, not a thread's: the first call that needs it sets it and the last one lifts it.
+# The limit applies to the whole process: the first call that needs it sets it, and the last one lifts it.
 _lock = threading.Lock()
 _running: list[threadpool_limits] = []
 
 
 @contextmanager
 def one_blas_thread() -> Iterator[None]:
-    """Keep each call into BLAS in this process to its thread; a context manager, and a decorator."""
+    """Limit BLAS calls in this process to one thread each; usable as context manager and decorator."""
     with _lock:
-        # Only the first finds, and at the end restores, what the process had before.
+        # Only the first one reads the previous limit, which is restored at the end.
         _running.append(_running[0] if _running else threadpool_limits(1, user_api="blas"))
     try:
         yield
@@ -38,10 +38,10 @@ def one_blas_thread() -> Iterator[None]:
 
 
 class SingleThreaded(Executor):
-    """An executor whose tasks run with one BLAS thread each, in whichever process or machine that is.
+    """An executor whose tasks run with one BLAS thread each, in any process or machine.
 
     Args:
-        executor: runs the tasks; whoever made it shuts it down.
+        executor: runs the tasks; its creator shuts it down.
     """
 
     def __init__(self, executor: Executor) -> None:

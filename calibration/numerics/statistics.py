@@ -1,6 +1,6 @@
 """A paired t-test, the tail of a sample, a cumulative sum chart, and evenly spread points.
 
-scipy.stats has relatives of them all; its import takes half a second, which every command would pay.
+scipy.stats has similar functions, but importing it takes half a second in every command.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ from calibration.observations import Floats
 
 Alarm = Literal["none", "worse", "better"]
 
-CHANCE = 0.01  # probability of a gain by chance below which it counts
-WORTHWHILE = 0.01  # relative; a smaller gain is not worth a change
+CHANCE = 0.01  # p-value below which a gain is significant
+WORTHWHILE = 0.01  # least relative gain that justifies a change
 
-# A standstill of three coordinates. More fixes of it share the errors of its readings, and scatter less than this.
+# A standstill has three coordinates. Further fixes of it share the errors of its readings, so they scatter less.
 _FREEDOM = 3.0
 _MIDDLE = 1.0 - 2.0 / (9.0 * _FREEDOM)
 _SPREAD = math.sqrt(2.0 / (9.0 * _FREEDOM))
 _SYMMETRIC = 1e-5  # skewness
-REFERENCE = 1.0  # a mean that is off by less is let pass: errors of 1.3 times the predicted RMS
-DECISION = 5.0  # of independent N(0, 1) scores, one false alarm in some 100,000 (Siegmund 1985)
-CLIP = 3.0  # one wrong shot never decides: a winsorised chart
+REFERENCE = 1.0  # tolerated shift of the mean score: errors of 1.3 times the predicted RMS
+DECISION = 5.0  # about one false alarm in 100,000 independent N(0, 1) scores (Siegmund 1985)
+CLIP = 3.0  # winsorised chart, so that a single wrong fix never raises an alarm
 
 
 @dataclass(frozen=True)
@@ -38,10 +38,9 @@ class PairedTest:
     Attributes:
         before_mm: RMS of the first estimate's 3-D error over all rows.
         after_mm: the same of the second estimate.
-        p: probability of such a gain by chance; 1 where fewer than two groups, or groups without any spread, allow
-            no test.
-        rows: how many there were.
-        groups: how many there were.
+        p: probability of such a gain by chance; 1 if there are fewer than two groups or their gains have no spread.
+        rows: number of rows.
+        groups: number of groups.
         no_worse: share of the groups in which the second estimate is no worse.
     """
 
@@ -54,7 +53,7 @@ class PairedTest:
 
     @property
     def is_better(self) -> bool:
-        """True if the second estimate is better beyond chance, and by enough to matter."""
+        """True if the second estimate is better by a significant and relevant amount."""
         return self.p < CHANCE and self.after_mm < (1.0 - WORTHWHILE) * self.before_mm
 
 
@@ -62,23 +61,23 @@ def chance_of_mean(draws: Floats) -> float:
     """Return the p-value of a one-sided one-sample t-test of mean > 0.
 
     Args:
-        draws: (n,) independent; fewer than two, or without any spread, allow no test, and p is 1.
+        draws: (n,) independent draws; p is 1 if there are fewer than two or they have no spread.
     """
     if len(draws) < 2 or (spread := float(draws.std(ddof=1))) == 0.0:
         return 1.0
-    from scipy.special import stdtr  # the daemon, which never tests anything, does without scipy
+    from scipy.special import stdtr  # imported here, so that the daemon, which makes no tests, runs without scipy
 
     return float(stdtr(len(draws) - 1, -draws.mean() / (spread / np.sqrt(len(draws)))))
 
 
 def chance_beyond(value: float, draws: Floats) -> float:
-    """Return the probability of more than a value, by the gamma distribution with the first three moments of draws.
+    """Return the probability of exceeding a value, by the gamma distribution with the first three moments of draws.
 
-    That is Pearson's type III, which sums of squares follow closely.
+    This is Pearson's type III distribution, which sums of squares follow closely.
 
     Args:
-        value: any.
-        draws: (n,) of the same quantity; without any spread they tell nothing, and the probability is 1.
+        value: any value.
+        draws: (n,) draws of the same quantity; without any spread the probability is 1.
     """
     from scipy.special import gammainc, gammaincc, ndtr
 
@@ -96,13 +95,12 @@ def chance_beyond(value: float, draws: Floats) -> float:
 def paired_test(before_mm2: Floats, after_mm2: Floats, groups: NDArray[np.str_] | NDArray[np.intp]) -> PairedTest:
     """Compare the squared errors of two estimates by a paired one-sided t-test over groups of rows.
 
-    Everything that is said to help is judged by this test: a residual learner within a calibration, and a model that is
-    to take another's place.
+    This test decides whether a residual learner is kept in a calibration, and whether a model replaces the current one.
 
     Args:
         before_mm2: (n,) squared 3-D errors of the first estimate, n > 0.
         after_mm2: (n,) the same of the second.
-        groups: (n,) labels of rows whose errors hang together; each group's mean gain is one draw.
+        groups: (n,) labels; rows with dependent errors have the same one. The mean gain of each group is one draw.
     """
     _, index, size = np.unique(groups, return_inverse=True, return_counts=True)
     gain = np.bincount(index, before_mm2 - after_mm2) / size
@@ -117,12 +115,12 @@ def paired_test(before_mm2: Floats, after_mm2: Floats, groups: NDArray[np.str_] 
 
 
 def score(mean_square: float) -> float:
-    """Return the score of a standstill, about N(0, 1) where the model is right.
+    """Return the score of a standstill, which is about N(0, 1) if the model is correct.
 
     The cube root of a mean of squares is close to normal (Wilson and Hilferty, PNAS 17, 1931).
 
     Args:
-        mean_square: of the standardised errors of its three coordinates.
+        mean_square: mean square of the standardised errors of its three coordinates.
     """
     normal = (math.cbrt(mean_square) - _MIDDLE) / _SPREAD
     return min(max(normal, -CLIP), CLIP)
@@ -150,7 +148,7 @@ class Cusum:
 
     @property
     def alarm(self) -> Alarm:
-        """`worse`: the machine is no longer what the model describes; `better`: the model's sigma is too large."""
+        """`worse`: the model no longer describes the machine; `better`: the model's sigma is too large."""
         if self.upper > DECISION:
             return "worse"
         return "better" if self.lower > DECISION else "none"
@@ -160,11 +158,11 @@ def halton(dimensions: int, count: int) -> Floats:
     """Return points that fill the unit box evenly (Halton 1960).
 
     Args:
-        dimensions: columns, one prime base each.
-        count: rows: the numbers 0, 1, 2, ... with their digits mirrored at the point.
+        dimensions: number of columns; each has its own prime base.
+        count: number of rows; row k is the number k with its digits mirrored at the radix point.
 
     Returns:
-        (count, dimensions) in [0, 1).
+        (count, dimensions) points in [0, 1).
     """
     points = np.zeros((count, dimensions))
     primes = (n for n in itertools.count(2) if all(n % divisor for divisor in range(2, n)))

@@ -1,4 +1,4 @@
-"""The calibrated model that fitted kinematics and effects make, with what people should know of it."""
+"""Construction of a calibrated model, with its outliers, intervals and warnings, from fitted kinematics and effects."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from calibration.identification.refinement import Prior
 from calibration.identification.solve import Solution
 from calibration.model.intervals import with_intervals
 from calibration.model.joint_errors import joint_error_scale
-from calibration.model.model import CalibratedModel, Coverage
+from calibration.model.model import CalibratedModel, TrainingExtent
 from calibration.model.prediction import Predictor
 from calibration.observations import Observations, data_sha256, is_original, row_digests
 from calibration.pipeline.training_warnings import training_warnings
@@ -34,20 +34,20 @@ def build_model(
     prior: Prior,
     provenance: Mapping[str, str | int | float],
 ) -> CalibratedModel:
-    """Build the model that kinematics and effects make, before any residual is learned.
+    """Build the model of kinematics and effects, before a residual is learned.
 
     Args:
         rig: the rig description.
-        rig_text: the TOML that it was read from.
+        rig_text: TOML text of the rig file.
         observations: training rows.
-        adopted: what was fitted to them.
+        adopted: kinematics and effects that were fitted to the training rows.
         prior: how the build tolerances were used.
-        provenance: of the fit: seed, method and whatever else is not known here.
+        provenance: provenance of the fit that is not known here, such as seed and method.
 
     Returns:
         The model with its outliers, prediction intervals and warnings.
     """
-    # What the kinematics alone found stays in the model; effects are put on top.
+    # The result of the kinematics alone stays in the model; effects are added to it.
     kinematics = replace(adopted.solution, fit=adopted.geometric, additions=None)
     fit, samples = kinematics.fit, kinematics.samples
     original = is_original(observations)
@@ -67,7 +67,7 @@ def build_model(
         repeat_sigma_mm=float(np.sqrt(samples.repeat_variance)),
         effects_noise_mm=_noise_mm(kinematics, distinct),
         identifiability=kinematics.identifiability,
-        coverage=Coverage(
+        coverage=TrainingExtent(
             {prism: int((distinct.prism == prism).sum()) for prism in rig.prism_names},
             {name: (float(v.min()), float(v.max())) for name, v in observations.joints.items()},
             tuple(name for name in rig.joint_names if context.is_torque_measured(name)),
@@ -94,9 +94,9 @@ def build_model(
 
 
 def with_effects(model: CalibratedModel, taken: Adopted) -> CalibratedModel:
-    """Return a model of the kinematics alone with the effects that were adopted.
+    """Return a model of the kinematics alone with the adopted effects added.
 
-    Their coefficients count among the parameters that the data must determine, but for those that outputs do not list.
+    Their coefficients count as parameters that the data must determine, except for those that are not reported.
     """
     solution, fit, parameters = taken.solution, taken.solution.fit, len(model.chain)
     seen = model.identifiability
@@ -125,14 +125,14 @@ def with_effects(model: CalibratedModel, taken: Adopted) -> CalibratedModel:
 
 
 def _payload(observations: Observations) -> tuple[float, float] | None:
-    """The lowest and highest `payload_kg`; None where no row has it."""
+    """Return the lowest and highest `payload_kg`; None if no row has it."""
     payload = observations.extra.get("payload_kg", np.empty(0))
     measured = payload[np.isfinite(payload)]
     return (float(measured.min()), float(measured.max())) if len(measured) else None
 
 
 def _loads(adopted: Adopted, context: EffectContext) -> dict[str, tuple[float, float]]:
-    """The lowest and highest load on every joint that has an effect of it."""
+    """Return the lowest and highest load on every joint that has an effect of its load."""
     loaded = {effect.where for effect in adopted.effects if library()[effect.family].load_kind == "torque"}
     loads = {name: context.torque(name) for name in sorted(loaded)}
     known = {name: load[np.isfinite(load)] for name, load in loads.items()}
@@ -140,7 +140,7 @@ def _loads(adopted: Adopted, context: EffectContext) -> dict[str, tuple[float, f
 
 
 def _noise_mm(solution: Solution, observations: Observations) -> float:
-    """RMS 3-D noise of one fix: station, readings, timing, repeats and what the kinematics lack."""
+    """Return the RMS 3-D noise of one fix due to station, readings, timing, repeats and errors of the kinematics."""
     chain, fit, samples = solution.chain, solution.fit, solution.samples
     lin = chain.linearise(fit.x, samples.data)
     station = station_covariance(chain.rig, observations.position_mm, observations.sigma_mm)

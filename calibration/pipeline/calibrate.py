@@ -1,4 +1,4 @@
-"""Calibrate a rig: identify kinematics and effects, train what corrects the residual, evaluate."""
+"""Calibrate a rig: identify kinematics and effects, train a learner of the residual, evaluate."""
 
 from __future__ import annotations
 
@@ -41,26 +41,26 @@ def calibrate(
     residual: Kind = "default",
     run: Run = DEFAULT_RUN,
 ) -> tuple[CalibratedModel, Evaluation]:
-    """Calibrate a rig from observations: identify, train the residual, evaluate.
+    """Calibrate a rig from observations: identify, train the residual learner, evaluate.
 
     Args:
         rig: the rig description.
-        rig_text: the TOML that it was read from; it travels in the model.
+        rig_text: TOML text of the rig file, which is stored in the model.
         observations: n training rows, all with positions, mm in the station's frame.
         prior: `recalibration` trusts the rig file's build tolerances, `as-built` estimates their scale.
         method: a name in `methods.METHODS`.
-        effects: `auto` for those that the data ask for, `none`, or FAMILY@WHERE,... by name.
-        residual: as `kind` of `train_residual`; by default the second paper's methods have their own network or none.
+        effects: `auto` for effects with evidence in the data, `none`, or FAMILY@WHERE,... by name.
+        residual: `kind` of `train_residual`; by default the second paper's methods use their own network or none.
         run: seed, workers, progress and checkpoint.
 
     Returns:
-        The model, and its errors on the training rows themselves.
+        The model, and its errors on the training rows.
 
     Raises:
         DataError: rows without positions, prisms that the rig lacks, data that the method or an effect cannot use.
-        UnsafeError: too few fixes, a base that cannot be placed, mirrored coordinates, another rig's data.
+        UnsafeError: too few fixes, a base that cannot be placed, mirrored coordinates, a different rig's data.
         CalibrationError: LightGBM's system library is missing.
-        ValueError: an unknown method or effect.
+        ValueError: the method or an effect is unknown.
     """
     observations = observations.numbered()
     model = identify(rig, rig_text, observations, prior=prior, method=method, effects=effects, run=run.part(0.0, 0.4))
@@ -84,9 +84,9 @@ def identify(
     effects: str = "auto",
     run: Run = DEFAULT_RUN,
 ) -> CalibratedModel:
-    """Identify the kinematics, and the effects that the data or the caller ask for.
+    """Identify the kinematics, and the effects that have evidence in the data or are requested.
 
-    Arguments are those of `calibrate`.
+    Arguments as `calibrate`.
 
     Returns:
         The model without a residual.
@@ -108,12 +108,12 @@ def train_residual(
     kind: Kind = "default",
     run: Run = DEFAULT_RUN,
 ) -> CalibratedModel:
-    """Learn what the kinematics leave over, and keep it only where it helps on held-out groups.
+    """Train a learner of the residual, and keep it only if it helps on held-out groups.
 
     Args:
         model: identified on the same rows.
         observations: training rows.
-        kind: one learner, `none`, or `default` for whichever is best.
+        kind: one learner, `none`, or `default` for the best.
         run: seed of folds and learners, workers, progress.
 
     Returns:
@@ -144,12 +144,12 @@ def train_residual(
 
 @one_blas_thread()
 def compensate_torques(model: CalibratedModel, observations: Observations, *, seed: int = 0) -> CalibratedModel:
-    """Add the second paper's network on the joint torques (RBF-TCM), as the paper has it: always kept.
+    """Add the second paper's network on the joint torques (RBF-TCM); as in the paper, it is always kept.
 
     Args:
         model: identified on the same rows.
         observations: training rows.
-        seed: of folds.
+        seed: seed of folds.
 
     Raises:
         UnsafeError: a set-up that the model does not know.
@@ -170,10 +170,10 @@ def compensate_torques(model: CalibratedModel, observations: Observations, *, se
 
 
 def rows_to_learn_from(model: CalibratedModel, observations: Observations) -> Flags:
-    """(n,) which rows a residual is learned from: neither outliers nor copies of an earlier row.
+    """Return an (n,) mask of the rows from which to learn a residual: neither outliers nor copies of earlier rows.
 
-    Where the kinematics leave much, and that is when there is most to learn, many rows are farther off than noise
-    explains; here an outlier is farther off than the other rows.
+    If the kinematics leave large errors, which is when there is most to learn, many errors exceed the noise. Therefore
+    the threshold for outliers here is relative to the median error.
     """
     require_positions(observations)
     size = Predictor.of(model).deviations(observations)
@@ -213,7 +213,7 @@ def _with_residual(
     excess = Predictor.of(model).unexplained_mm2(rows, decision.variance_mm2)
     prisms = tuple(np.unique(rows.prism).tolist())
     learned = LearnedResidual(decision.residual, signals, prisms, excess, region)
-    # Trained on all rows, the learner leaves less than those of the folds did.
+    # The errors of the learner trained on all rows are smaller than those of the folds' learners.
     less = np.sqrt(decision.variance_mm2.sum() / (decision.left_mm**2).mean(axis=0).sum())
     return with_intervals(
         replace(told, residual=learned),
@@ -224,15 +224,15 @@ def _with_residual(
 
 
 def require_known_setups(training: Observations, held_out: Observations, remedy: str) -> None:
-    """Refuse held-out rows from a set-up whose base no training row determines.
+    """Raise UnsafeError for held-out rows from a set-up without training rows, as its base is not known.
 
     Args:
-        training: rows that are fitted.
-        held_out: rows that judge the fit.
-        remedy: what to do about such a set-up, the end of the message.
+        training: rows of the fit.
+        held_out: rows for testing the fit.
+        remedy: what to do about such a set-up, for the end of the message.
 
     Raises:
-        UnsafeError: the held-out rows have such a set-up.
+        UnsafeError: there is such a set-up.
     """
     known = set(training.setup.tolist())
     unknown = sorted(set(held_out.setup.tolist()) - known)

@@ -1,4 +1,4 @@
-"""Find what the simulation lacks: calibrate, and keep the search's evidence, forecasts and proposals as an answer."""
+"""Find effects missing in a simulation: calibrate, and return evidence, forecasts and proposals of the search."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from calibration.run_settings import DEFAULT_RUN, Run
 
 _FOLDS = 10
 _LISTED = 12  # candidates of a round
-_EXCESS_SEEN = 0.2  # of the known noise's standard deviation; less is none
+_EXCESS_SEEN = 0.2  # of the known noise's standard deviation; less is not mentioned
 
 
 def find_gap(
@@ -48,31 +48,33 @@ def find_gap(
     families: Collection[str] | None = None,
     run: Run = DEFAULT_RUN,
 ) -> GapResult:
-    """Find where simulation and measurement disagree, name the effect that is missing, and add it.
+    """Find where simulation and measurement disagree, name the missing effects, and add them.
 
-    This is `calibrate` without a residual, with all that it found on the way kept as an answer.
+    This is `calibrate` without a residual, but it also returns all intermediate results of the search.
 
     Args:
         rig: the rig description.
-        rig_text: the TOML that it was read from; it travels in the model.
+        rig_text: TOML text of the rig file, which is stored in the model.
         observations: n training rows, all with positions, mm in the station's frame.
-        holdout: further rows, at set-ups of the training rows, that no fit sees.
+        holdout: further rows, at set-ups of the training rows, that are not used in any fit.
         prior: `recalibration` trusts the rig file's build tolerances, `as-built` estimates their scale.
-        families: of effects that may be named; the whole library by default.
+        families: families of effects that may be named; the whole library by default.
         run: seed, workers, progress and checkpoint.
 
     Returns:
-        The verdict with its evidence, the model with the effects that were named, and what to measure next.
+        The verdict with its evidence, the model with the named effects, and what to measure next.
 
     Raises:
         DataError: rows without positions, prisms that the rig lacks.
-        UnsafeError: too few fixes, a base that cannot be placed, mirrored coordinates, another rig's data, a set-up of
-            the held-out rows that the training rows lack.
+        UnsafeError: too few fixes, a base that cannot be placed, mirrored coordinates, a different rig's data, held-out
+            rows of a set-up that the training rows lack.
     """
     require_positions(observations)
     if holdout is not None:
         require_positions(holdout)
-        remedy = "hold out rows of those, or judge the model on these afterwards with evaluate --refit-base"
+        remedy = (
+            "hold out rows of these set-ups, or test the model at the new one afterwards with evaluate --refit-base"
+        )
         require_known_setups(observations, holdout, remedy)
     observations = observations.numbered()
     families = library() if families is None else families
@@ -94,7 +96,7 @@ def _answer(
     seed: int,
     rng: np.random.Generator,
 ) -> GapResult:
-    """Return the answer: what the search found, as errors, evidence, forecasts and proposals."""
+    """Return the result of the search: errors, evidence, forecasts and proposals."""
     found, samples = rest.found, rest.adopted.solution.samples
     before = detect(Grammar(found.initial), rng) if found.joint.choices else rest.detection
     effects = found.adopted.effects
@@ -108,7 +110,7 @@ def _answer(
     predictor = Predictor.of(model)
     error_before = observations.position_mm - predictor.geometric_mm(observations)
     error_after = observations.position_mm - predictor.effects_mm(observations)
-    is_counted = found.joint.fit.weight[samples.of_row] > 0.5  # gross outliers are no structure
+    is_counted = found.joint.fit.weight[samples.of_row] > 0.5  # gross outliers do not count
     noise_mm, source = _noise(samples, found, observations, scatter_is_noise=not rest.significant)
     held_out = None
     if holdout is not None:
@@ -157,9 +159,9 @@ def rms(error_mm: Floats) -> float:
 def _rounds(
     found: SearchResult, observations: Observations, holdout: Observations | None, seed: int
 ) -> Iterator[Round]:
-    """Yield the search's steps for outputs, each with its error on held-out groups or rows."""
+    """Yield the steps of the search for output, each with its error on held-out groups or rows."""
     fold, samples = folds(found.initial.groups, _FOLDS, seed), found.initial.samples
-    # Repeats of a standstill are one sample of a fit; the noise is that of a fix.
+    # Repeats of a standstill are one sample of a fit, but the noise to report is that of a single fix.
     from_mean = observations.position_mm - samples.position_mm[samples.of_row]
     for step in found.refitted_steps():
         if holdout is None:
@@ -174,7 +176,7 @@ def _rounds(
 
 
 def _positions(joint: JointFit, observations: Observations) -> Floats:
-    """Return (n, 3) positions of other rows by kinematics and effects of a fit."""
+    """Return (n, 3) positions of other rows predicted by kinematics and effects of a fit."""
     chain = joint.context.chain
     x = joint.fit.x[: len(chain)]
     context = replace(joint.context, x=x, observations=observations)
@@ -184,7 +186,7 @@ def _positions(joint: JointFit, observations: Observations) -> Floats:
 
 
 def _candidate(step: SelectionStep, scored: ScoredEffect) -> Candidate:
-    """Return one of a step's candidates for outputs."""
+    """Return one candidate of a step for output."""
     context, choice = step.fit.context, scored.choice
     family = library()[choice.family]
     coefficients = family.coefficients(context, choice.where, choice.settings)
@@ -196,16 +198,16 @@ def _candidate(step: SelectionStep, scored: ScoredEffect) -> Candidate:
         scored.log_bayes_factor,
         scored.fitted(context).reported,
         {c.name: (c.lower, c.upper) for c in coefficients} | dict(family.reported_limits()),
-        "" if named else step.reasons.get(str(scored.candidate), "nothing asks for it beside the others"),
+        "" if named else step.reasons.get(str(scored.candidate), "no further evidence for it, given the others"),
     )
 
 
 def _noise(
     samples: Samples, found: SearchResult, observations: Observations, *, scatter_is_noise: bool
 ) -> tuple[float, str]:
-    """Return the RMS 3-D noise of one fix, and where it is known from, a clause.
+    """Return the RMS 3-D noise of one fix, and a clause about its source.
 
-    Scatter beyond the known noise is noise too, unless it depends on something.
+    Scatter in excess of the known noise counts as noise, unless it is systematic.
     """
     rig, fit = found.joint.context.rig, found.joint.fit
     station = station_covariance(rig, observations.position_mm, observations.sigma_mm)
@@ -218,7 +220,7 @@ def _noise(
         source += ", raised to the scatter of repeats"
     excess = 3.0 * fit.excess_variance if scatter_is_noise else 0.0
     if excess > _EXCESS_SEEN**2 * known:
-        source += f", and {np.sqrt(excess):.2g} mm that the data scatter beyond it"
+        source += f", and {np.sqrt(excess):.2g} mm of excess scatter in the data"
     return float(np.sqrt(known + excess)), source
 
 
@@ -234,5 +236,5 @@ def _warnings(
     if holdout is not None:
         yield from (f"in the held-out rows: {warning}" for warning in model_warnings(model, holdout))
     if found.formulas and found.adopted.effects:
-        yield "what is left over depends on what no effect of the library explains"
+        yield "the remaining errors depend on something that no effect of the library explains"
     yield from partly_known(found.joint.context, families)

@@ -1,4 +1,4 @@
-"""Registry of the methods that identify a rig: the default and those of two published papers."""
+"""Registry of the methods to identify a rig: the default and those of two published papers."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from calibration.run_settings import Run
 
 @dataclass(frozen=True)
 class Task:
-    """Observations to identify a rig from.
+    """A task to identify a rig from observations.
 
     Attributes:
         rig: the rig description.
@@ -44,12 +44,12 @@ class Task:
 
 @dataclass(frozen=True)
 class Method:
-    """A way to identify a rig.
+    """A method to identify a rig.
 
     Attributes:
-        identify: fits kinematics and effects.
-        residual: the learner that completes it where no other is asked for.
-        takes_effects: True if effects may be asked for by name.
+        identify: function that fits kinematics and effects.
+        residual: default learner of the residual.
+        takes_effects: whether effects may be requested by name.
     """
 
     identify: Callable[[Task], Adopted]
@@ -70,13 +70,13 @@ def find_effects(
     Args:
         rig: the rig description.
         observations: rows with positions.
-        families: of effects that may be named.
+        families: families of effects that may be named.
         prior: trust the build tolerances, or estimate their scale.
         run: seed, workers, progress and checkpoint.
-        rng: draws the signs of the last test.
+        rng: generator for the signs in the last test.
 
     Raises:
-        DataError, UnsafeError: as `solve`; much of the data is left out by kinematics with effects.
+        DataError, UnsafeError: as `solve`; also UnsafeError if kinematics with effects leave out much of the data.
     """
     solution = solve(rig, observations, prior=prior, run=run.part(0.0, 0.4))
     run.progress(0.4, "looking for missing effects")
@@ -87,7 +87,7 @@ def find_effects(
 
 
 def effects_rng(seed: int) -> np.random.Generator:
-    """Return the generator for `find_effects` and for what follows from its result."""
+    """Return the generator for `find_effects` and for the processing of its result."""
     return np.random.default_rng([seed, 1])
 
 
@@ -95,9 +95,9 @@ def identify_by(method: str, task: Task) -> Adopted:
     """Fit kinematics and effects by one of `METHODS`.
 
     Raises:
-        ValueError: an unknown method or effect, or effects for a method that takes none.
-        DataError: data that the method cannot use.
-        UnsafeError: as the method refuses.
+        ValueError: the method or an effect is unknown, or the method takes no effects.
+        DataError: the method cannot use the data.
+        UnsafeError: the method refuses the data.
     """
     if method not in METHODS:
         raise ValueError(f"method {method!r} is not available; available: {', '.join(METHODS)}")
@@ -105,7 +105,7 @@ def identify_by(method: str, task: Task) -> Adopted:
     if not chosen.takes_effects and task.effects not in ("auto", "none"):
         raise ValueError(f"method {method!r} takes no effects; leave {task.effects!r} out, or use the default method")
     if task.effects not in ("auto", "none"):
-        parse_effects(task.effects, task.rig)  # a wrong name is told before the search, which takes its time
+        parse_effects(task.effects, task.rig)  # report a wrong name before the slow search
     return chosen.identify(task)
 
 

@@ -1,1 +1,1 @@
-"""Learners of the error that kinematics leave over, kept only where they help on held-out groups."""
+"""Learners of the errors that kinematics and effects leave, kept only if they help on held-out groups."""

@@ -1,4 +1,4 @@
-"""Baselines that learners are compared with: the field's correction table, and the first paper's network as printed."""
+"""Baselines for comparison with the learners: the industry's correction table and the first paper's network."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from calibration.residual.folds import folds
 from calibration.residual.rbf.rbfn import k_means
 from calibration.residual.rbf.relevance import gaussian
 
-THETA = 0.05
+THETA = 0.05  # the paper's factor on distances
 
 _RINGS = 10
 _SECTORS = 24
@@ -22,18 +22,18 @@ _HORIZONTAL = ("prism_x_mm", "prism_y_mm")
 _CENTRES = 100
 _THETAS = (0.05, 0.1, 0.2, 0.4, 0.8, 1.6, 3.2, 6.4)
 _FOLDS = 5
-_PRISM = "prism_"  # the paper's inputs end with the frames
+_PRISM = "prism_"  # prefix of columns that are not among the paper's inputs
 
 
 @dataclass(frozen=True)
 class CorrectionTable:
-    """The field's incumbent: a table of mean errors, one for each cell of boom reach and direction, of one prism.
+    """Industry practice: a table of the mean errors of one prism in each cell of boom reach and direction.
 
-    Cells are as a contractor lays them out: rings of a tenth of the longest reach, and sectors of 15 degrees.
+    Cells are as contractors define them: rings of a tenth of the longest reach, and sectors of 15 degrees.
 
     Attributes:
         ring_mm: width of a ring.
-        correction_mm: (rings + 1, sectors, 3) in the base frame; zero where nothing was measured, and beyond all rings.
+        correction_mm: (rings + 1, sectors, 3) in the base frame; zero in cells without fixes and beyond the last ring.
     """
 
     ring_mm: float
@@ -48,7 +48,7 @@ class CorrectionTable:
             target_mm: (n, 3) residuals in the base frame.
         """
         reach_mm = np.hypot(*features.columns(_HORIZONTAL).T)
-        ring_mm = max(float(reach_mm.max()), 1.0) * (1.0 + 1e-9) / _RINGS  # the longest is inside
+        ring_mm = max(float(reach_mm.max()), 1.0) * (1.0 + 1e-9) / _RINGS  # the longest reach is inside
         cell = np.ravel_multi_index(_cells(features, ring_mm), (_RINGS + 1, _SECTORS))
         cells = (_RINGS + 1) * _SECTORS
         fixes = np.maximum(np.bincount(cell, minlength=cells), 1)
@@ -56,14 +56,14 @@ class CorrectionTable:
         return cls(ring_mm, (total / fixes[:, None]).reshape(_RINGS + 1, _SECTORS, 3))
 
     def predict(self, features: Features) -> Floats:
-        """(n, 3) correction in the base frame, mm."""
+        """Return the (n, 3) correction in the base frame, mm."""
         ring, sector = _cells(features, self.ring_mm)
         inside = (ring < _RINGS)[:, None]
         return np.where(inside, self.correction_mm[ring, sector], 0.0)
 
 
 def _cells(features: Features, ring_mm: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Ring and sector of every row; all that is beyond the rings is in one more."""
+    """Return ring and sector of every row; rows beyond the last ring are in an additional one."""
     x, y = features.columns(_HORIZONTAL).T
     ring = np.minimum(np.hypot(x, y) // ring_mm, _RINGS).astype(np.intp)
     sector = np.floor((np.arctan2(y, x) / (2.0 * np.pi) + 0.5) * _SECTORS).astype(np.intp) % _SECTORS
@@ -74,19 +74,21 @@ def _cells(features: Features, ring_mm: float) -> tuple[NDArray[np.intp], NDArra
 class PaperRbfn:
     """The first paper's network (Zhou et al. 2022, Eqs. 12-13) as printed: 36 inputs, 100 centres, width 0.05.
 
-    Inputs are the joint values and the frames' origins (on the paper's boom 9 + 27), each brought to 0..1 by the range
-    of the training rows; the network belongs to one point of the boom, as the paper's does to the feed's end. Centres
-    are those of k-means, which the paper does not say; the outputs x, y, z are sums of all units by least squares.
+    Inputs are the joint values and the frames' origins (9 + 27 on the paper's boom), each scaled to 0..1 by its range
+    in the training rows. A network is for one point of the boom, as the paper's is for the end of the feed. Centres
+    are found by k-means, as the paper does not specify them. The outputs x, y, z are weighted sums of all units, fitted
+    by least squares.
 
-    The width needs a reading. As a Gaussian's standard deviation, 0.05 among 36 inputs in 0..1 leaves every unit zero
-    but at its own centre, and the network would say nothing of any other pose. It is read here as the factor on the
-    distance, exp(-(theta |x - c|)^2), as in the second paper's network and in the toolbox whose notation both follow.
+    The meaning of the width has to be inferred. As the standard deviation of a Gaussian, 0.05 among 36 inputs in 0..1
+    makes every unit zero except at its own centre, so the network would predict zero at all other poses. Here it is the
+    factor on the distance, exp(-(theta |x - c|)^2), as in the second paper's network and in the toolbox whose notation
+    both papers follow.
 
     Attributes:
         theta: factor on distances.
-        low: (d,) least value of each input.
-        scale: (d,) one over its range; 0 for a constant one.
-        centres: (m, d) among the inputs in 0..1.
+        low: (d,) lowest training value of each input.
+        scale: (d,) 1 / range of each input; 0 for a constant one.
+        centres: (m, d) in scaled inputs.
         output: (m, 3) weights, mm.
     """
 
@@ -104,7 +106,7 @@ class PaperRbfn:
             features: n rows.
             target_mm: (n, 3) residuals in the base frame.
             theta: factor on distances.
-            seed: of the centres' first places.
+            seed: seed of the initial centres.
         """
         inputs = _inputs(features)
         low, size = inputs.min(axis=0), np.ptp(inputs, axis=0)
@@ -115,7 +117,7 @@ class PaperRbfn:
         return cls(theta, low, scale, centres, np.asarray(output, dtype=np.float64))
 
     def predict(self, features: Features) -> Floats:
-        """(n, 3) estimate of the residual in the base frame, mm."""
+        """Return the (n, 3) estimate of the residual in the base frame, mm."""
         return _activation((_inputs(features) - self.low) * self.scale, self.centres, self.theta) @ self.output
 
 
@@ -125,8 +127,8 @@ def best_theta(features: Features, target_mm: Floats, groups: NDArray[np.str_], 
     Args:
         features: n rows of one prism.
         target_mm: (n, 3) residuals in the base frame.
-        groups: (n,) labels that no fold separates, at least two.
-        seed: of folds and centres.
+        groups: (n,) labels, at least two; no fold separates rows with the same one.
+        seed: seed of folds and centres.
     """
     split = folds(groups, _FOLDS, seed)
     error = dict.fromkeys(_THETAS, 0.0)

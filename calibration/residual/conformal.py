@@ -1,8 +1,8 @@
-"""Intervals that hold 90 % of what is measured, whatever the shape of the errors (split conformal prediction).
+"""Intervals that contain 90 % of measurements, whatever the distribution of errors (split conformal prediction).
 
-A formal standard deviation, propagated from noise and covariances, says how errors compare between predictions. How
-many of them an error may be is counted on rows that the model was fitted without (Papadopoulos et al. 2002; Lei et al.
-2018), along each axis by itself: what gravity does to a boom is in one of them.
+Formal standard deviations, propagated from noise and covariances, give the relative size of the errors of predictions.
+The number of standard deviations that an error may reach is calibrated on rows that were held out of the model's fit
+(Papadopoulos et al. 2002; Lei et al. 2018), separately for each axis, because gravity bends a boom along one of them.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from scipy.special import chdtri, ndtri
 from calibration.observations import Floats
 
 LEVEL = 0.9
-NORMAL = float(ndtri((1.0 + LEVEL) / 2.0))  # standard deviations that hold a normal error
+NORMAL = float(ndtri((1.0 + LEVEL) / 2.0))  # standard deviations that contain a normal error with probability LEVEL
 _NORMAL_RADIUS = float(np.sqrt(chdtri(3, 1.0 - LEVEL) / 3.0))
 
 
@@ -24,79 +24,79 @@ class Coverage:
     """Share of errors inside their intervals.
 
     Attributes:
-        axes: of x, y and z.
-        radius: of the balls.
+        axes: shares for x, y and z.
+        radius: share inside the balls.
     """
 
     axes: tuple[float, ...]
     radius: float
 
     def as_dict(self) -> dict[str, object]:
-        """Object in the JSON of `calibrate` and `evaluate`."""
+        """Return the object in the JSON of `calibrate` and `evaluate`."""
         return {"level": LEVEL, "axis_coverage": list(self.axes), "radius_coverage": self.radius}
 
 
 @dataclass(frozen=True)
 class Intervals:
-    """Number of formal standard deviations that hold an error with probability `LEVEL`.
+    """Number of formal standard deviations that contain an error with probability `LEVEL`.
 
     Attributes:
-        axes: of the error along x, y, z of the station's frame.
-        radius: of its 3-D norm, in units of the root of the three variances' sum.
+        axes: for the error along x, y, z of the station's frame.
+        radius: for its 3-D norm, in units of the square root of the sum of the three variances.
     """
 
     axes: tuple[float, float, float] = (NORMAL,) * 3
     radius: float = _NORMAL_RADIUS
 
     def at_other_setups(self) -> Intervals:
-        """Intervals where nobody knows which way x and y point, seen from the machine; z is up at all set-ups."""
+        """Return intervals for set-ups with x and y in any direction as seen from the machine; z is always up."""
         level = float(np.sqrt((self.axes[0] ** 2 + self.axes[1] ** 2) / 2.0))
         return Intervals((level, level, self.axes[2]), self.radius)
 
     def or_wider(self, other: Intervals) -> Intervals:
-        """Intervals that are, along each axis and for the norm, the wider of two."""
+        """Return the wider of two intervals, separately for each axis and for the norm."""
         x, y, z = np.maximum(self.axes, other.axes).tolist()
         return Intervals((x, y, z), max(self.radius, other.radius))
 
     def half_mm(self, formal_mm: Floats) -> Floats:
-        """Half widths (n, 3) of the intervals of x, y and z, given formal standard deviations (n, 3)."""
+        """Return half widths (n, 3) of the intervals of x, y, z for formal standard deviations (n, 3), all in mm."""
         half_mm: Floats = formal_mm * np.array(self.axes)
         return half_mm
 
     def radius_mm(self, formal_mm: Floats) -> Floats:
-        """Radii (n,) of the balls, given formal standard deviations (n, 3)."""
+        """Return radii (n,) of the balls for formal standard deviations (n, 3), all in mm."""
         radius_mm: Floats = self.radius * np.linalg.norm(formal_mm, axis=1)
         return radius_mm
 
 
 @dataclass(frozen=True)
 class StageIntervals:
-    """Intervals of a model with a residual learner, and of its stage before, which hold where the learner is not used.
+    """Intervals of a model with a residual learner, and without it for rows where the learner is not used.
 
-    What was counted where a learner is used says nothing of where it is not.
+    Intervals that were calibrated with a learner are not valid where the learner is not used.
 
     Attributes:
-        hybrid: of the model with its learner; the same as below where it has none.
-        effects: of kinematics and effects alone.
+        hybrid: intervals of the model with its learner; equal to `effects` if it has none.
+        effects: intervals of kinematics and effects alone.
     """
 
     hybrid: Intervals = Intervals()
     effects: Intervals = Intervals()
 
     def at_other_setups(self) -> StageIntervals:
-        """Intervals where nobody knows which way x and y point, seen from the machine."""
+        """Return intervals for set-ups with x and y in any direction as seen from the machine."""
         return StageIntervals(self.hybrid.at_other_setups(), self.effects.at_other_setups())
 
     def or_wider(self, other: Intervals) -> StageIntervals:
-        """Intervals that are, at each stage, the wider of these and another."""
+        """Return the wider of these intervals and another, separately for each stage."""
         return StageIntervals(self.hybrid.or_wider(other), self.effects.or_wider(other))
 
     def half_mm(self, formal_mm: Floats, weight: Floats | None) -> Floats:
-        """Half widths (n, 3) of the intervals of x, y and z.
+        """Return half widths (n, 3) of the intervals of x, y and z, mm.
 
         Args:
             formal_mm: (n, 3) formal standard deviations.
-            weight: (n,) of the learner in each row, 0 to 1; None for a model that has none.
+            weight: (n,) weight of the learner in each row, 0 to 1; None for a model without a learner.
         """
         if weight is None:
             return self.effects.half_mm(formal_mm)
@@ -104,7 +104,7 @@ class StageIntervals:
         return weight[:, None] * used + (1.0 - weight)[:, None] * unused
 
     def radius_mm(self, formal_mm: Floats, weight: Floats | None) -> Floats:
-        """Radii (n,) of the balls; arguments are those of `half_mm`."""
+        """Return radii (n,) of the balls, mm; arguments as `half_mm`."""
         if weight is None:
             return self.effects.radius_mm(formal_mm)
         used, unused = self.hybrid.radius_mm(formal_mm), self.effects.radius_mm(formal_mm)
@@ -112,20 +112,20 @@ class StageIntervals:
 
 
 def coverage(error_mm: Floats, half_mm: Floats, radius_mm: Floats) -> Coverage:
-    """Share of errors (n, 3) inside intervals of these half widths (n, 3) and inside balls of these radii (n,)."""
+    """Return the share of errors (n, 3) inside intervals of half widths (n, 3) and inside balls of radii (n,)."""
     axes = (np.abs(error_mm) <= half_mm).mean(axis=0)
     radius = (np.linalg.norm(error_mm, axis=1) <= radius_mm).mean()
     return Coverage(tuple(axes.tolist()), float(radius))
 
 
 def conformal_intervals(error_mm: Floats, formal_mm: Floats, independent: int) -> Intervals:
-    """Count the formal standard deviations that hold held-out errors.
+    """Find the number of formal standard deviations that contain 90 % of held-out errors.
 
     Args:
-        error_mm: (n, 3) errors of rows that the model was fitted without, in the station's frame.
-        formal_mm: (n, 3) their formal standard deviations.
-        independent: how many of the rows are independent of each other; a new one exceeds the largest of m with
-            probability 1 / (m + 1), so few of them make the intervals wider.
+        error_mm: (n, 3) errors of rows held out of the model's fit, in the station's frame.
+        formal_mm: (n, 3) formal standard deviations of these errors.
+        independent: number of mutually independent rows, m. A new error exceeds the largest of m with probability
+            1 / (m + 1), so fewer rows make the intervals wider.
     """
     scaled = np.abs(error_mm) / formal_mm
     norm = np.linalg.norm(error_mm, axis=1) / np.linalg.norm(formal_mm, axis=1)

@@ -1,4 +1,4 @@
-"""Cross-validation of the learners of the residual: estimates of rows by learners that were trained without them."""
+"""Cross-validation of residual learners: estimates for rows by learners that were trained without these rows."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from calibration.residual.folds import folds
 from calibration.residual.gaussian.process import CurveTerms, fit_gaussian_process
 from calibration.residual.learners import with_estimate, with_out_of_fold_estimate
 from calibration.residual.rbf.rbfn import Shape, choose_shape, fit_shape
-from calibration.residual.trees.boosting import Settings, Tuned, cross_validate
+from calibration.residual.trees.boosting import BoostingSettings, Tuned, cross_validate
 
 Labels = NDArray[np.str_]
 _T = TypeVar("_T")
 
-MANY_ROWS = 1000  # of which a fold's hardly change what suits them
+MANY_ROWS = 1000  # from which on the best hyperparameters hardly depend on the fold left out
 _PROBED_FOLDS = 2
 
 
@@ -33,8 +33,8 @@ class Data:
     Attributes:
         features: n rows.
         target_mm: (n, 3) residuals in the base frame.
-        groups: (n,) labels that no fold separates.
-        units: (n,) labels that are no coarser, for splits inside a single group.
+        groups: (n,) labels; no fold separates rows with the same one.
+        units: (n,) labels of groups or finer, for splits within a single group.
     """
 
     features: Features
@@ -43,12 +43,12 @@ class Data:
     units: Labels
 
     def select(self, rows: NDArray[np.bool_]) -> Data:
-        """Rows by mask."""
+        """Return rows by mask."""
         return Data(self.features.select(rows), self.target_mm[rows], self.groups[rows], self.units[rows])
 
     @property
     def labels(self) -> Labels:
-        """(n,) labels to split by: groups, or the units of the only one, or the rows of the only unit."""
+        """(n,) labels to split by: groups; units if there is only one group; rows if there is only one unit."""
         for labels in (self.groups, self.units):
             if len(np.unique(labels)) > 1:
                 return labels
@@ -57,11 +57,11 @@ class Data:
 
 @dataclass(frozen=True)
 class Shared:
-    """Parts that learners of many rows share, whichever fold is left out; None for those that each finds itself.
+    """Parts that the learners of all folds share if there are many rows; None for parts that each learner finds itself.
 
     Attributes:
-        shape: of networks.
-        terms: to begin with in the search for a Gaussian process.
+        shape: shape of the networks.
+        terms: initial terms in the search for a Gaussian process.
     """
 
     shape: Shape | None = None
@@ -71,20 +71,20 @@ class Shared:
 class CrossValidation:
     """Out-of-fold estimates of the learners for one division into folds.
 
-    A fold's learner finds by itself what suits the rows of the other folds. Where rows are many that hardly depends on
-    the fold: what is found without the first one serves all, networks as it is, and terms as a start, of which the
-    evidence of its own rows leaves each fold what it needs.
+    The learner of a fold finds its hyperparameters on the rows of the other folds. With many rows these hardly depend
+    on the fold, so the result without the first fold is used for all: the shape of networks as it is, and the terms of
+    Gaussian processes as a start, from which the evidence of its own rows leaves each fold the terms that it needs.
 
     Args:
         data: all rows.
-        count: number of folds; fewer where there are fewer groups.
-        seed: of folds and learners.
-        executor: runs what is independent; results do not depend on it.
-        advance: told after each piece of work.
-        shared: what is known of these rows.
+        count: number of folds; there are fewer if there are fewer groups.
+        seed: seed of folds and learners.
+        executor: runs independent work; results do not depend on it.
+        advance: called after each piece of work.
+        shared: shared parts that are already known for these rows.
 
     Attributes:
-        shared: the same, and what was found since.
+        shared: shared parts known so far.
     """
 
     def __init__(
@@ -108,15 +108,15 @@ class CrossValidation:
         self._has_many = len(data.features) >= MANY_ROWS
         self._own_shapes: list[Shape] = []
 
-    def estimate(self, kind: str, settings: Settings | None = None) -> tuple[Floats, Tuned | None]:
+    def estimate(self, kind: str, settings: BoostingSettings | None = None) -> tuple[Floats, Tuned | None]:
         """Estimate each row by a learner that was trained without its fold.
 
         Args:
             kind: `rbfn`, `lightgbm`, `chain` or `gp`.
-            settings: of the trees; tuned if left out.
+            settings: settings of the trees; tuned if left out.
 
         Returns:
-            (n, 3) estimates, mm; settings and number of the trees, None without trees.
+            (n, 3) estimates, mm; and settings and number of trees, None without trees.
         """
         if kind == "gp":
             return self._joined(self._processes()), None
@@ -129,15 +129,15 @@ class CrossValidation:
         parts = self._map(_chain_features, self._training, self._held, shapes)
         return self._trees(parts, settings, parts[0][0].names)
 
-    def probe(self, kind: str, settings: Settings) -> tuple[NDArray[np.bool_], Floats]:
-        """Estimate the rows of two folds alone, which tells whether a learner is worth the work of all of them.
+    def probe(self, kind: str, settings: BoostingSettings) -> tuple[NDArray[np.bool_], Floats]:
+        """Estimate the rows of two folds alone, to decide whether a learner is worth the work for all folds.
 
         Args:
             kind: `rbfn`, `lightgbm` or `chain`.
-            settings: of the trees.
+            settings: settings of the trees.
 
         Returns:
-            (n,) rows of these folds; their estimates, mm.
+            (n,) mask of the rows of these folds, and their estimates, mm.
         """
         rows = self.split < _PROBED_FOLDS
         training, held = self._training[:_PROBED_FOLDS], self._held[:_PROBED_FOLDS]
@@ -154,7 +154,7 @@ class CrossValidation:
         return rows, estimate_mm[rows]
 
     def _shapes(self, count: int) -> list[Shape]:
-        """Shapes of the networks of the first folds."""
+        """Return the shapes of the networks of the first folds."""
         if self._has_many:
             shape = self.shared.shape or self._map(best_shape, self._training[:1])[0]
             self.shared = replace(self.shared, shape=shape)
@@ -163,7 +163,7 @@ class CrossValidation:
         return self._own_shapes[:count]
 
     def _processes(self) -> list[Floats]:
-        """Estimates of each fold's rows by a Gaussian process."""
+        """Return estimates of each fold's rows by a Gaussian process."""
         found: list[tuple[Floats, CurveTerms | None]] = []
         if self._has_many and self.shared.terms is None:
             found = self._map(_process_estimate, self._training[:1], self._held[:1])
@@ -186,7 +186,7 @@ class CrossValidation:
         return out
 
     def _trees(
-        self, parts: Sequence[tuple[Features, Features]], settings: Settings | None, names: Sequence[str] | None
+        self, parts: Sequence[tuple[Features, Features]], settings: BoostingSettings | None, names: Sequence[str] | None
     ) -> tuple[Floats, Tuned]:
         target, split = self.data.target_mm, self.split
         found = cross_validate(parts, target, split, self.seed, self._executor, settings=settings, names=names)
@@ -195,7 +195,7 @@ class CrossValidation:
 
 
 def best_shape(data: Data, seed: int) -> Shape:
-    """Shape of the network that suits some rows best."""
+    """Return the shape of the network that is best for some rows."""
     return choose_shape(data.features, data.target_mm, data.labels, seed)
 
 
@@ -206,13 +206,13 @@ def _network_estimate(training: Data, held: Features, shape: Shape, *, seed: int
 def _process_estimate(
     training: Data, held: Features, *, seed: int, start: CurveTerms | None = None
 ) -> tuple[Floats, CurveTerms | None]:
-    """Estimates of held-out rows, and the terms that they rest on."""
+    """Return estimates of held-out rows and the terms of the process."""
     process = fit_gaussian_process(training.features, training.target_mm, seed, start)
     return (np.zeros((len(held), 3)), None) if process is None else (process.predict(held), process.found)
 
 
 def _chain_features(training: Data, held: Features, shape: Shape, *, seed: int) -> tuple[Features, Features]:
-    """Features of training rows and of held-out rows as the chain's trees see them."""
+    """Return features of training and held-out rows with the network's estimates, for the trees of a chain."""
     estimate = _network_estimate(training, held, shape, seed=seed)
     seen = with_out_of_fold_estimate(training.features, training.target_mm, training.labels, shape, seed)
     return seen, with_estimate(held, estimate)

@@ -1,4 +1,4 @@
-"""Features of an observation for residual learners, computed in one place for training and prediction alike."""
+"""Features of observations for residual learners, computed in one place for both training and prediction."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from calibration.numerics.jit import compiled, part
 from calibration.observations import ROW, Floats, Observations
 from calibration.rig.description import Rig
 
-_NOT_FEATURES = frozenset({"time_s", ROW})  # a tree that splits on time knows the past alone
-_LEAST_MEASURED = 0.5
-_VARYING = 1e-6  # of the largest load
+_NOT_FEATURES = frozenset({"time_s", ROW})  # a tree that splits on time cannot generalise to the future
+_LEAST_MEASURED = 0.5  # share of the rows
+_VARYING = 1e-6  # of the largest load; loads that vary less count as constant
 DEFLECTION = ("deflection_x_mm", "deflection_y_mm", "deflection_z_mm")
-_COMPLIANCE_RAD_PER_NM = 1e-7  # of every joint: what counts of a deflection is its shape
-_RIGID = 6  # ways in which a base can be off
+_COMPLIANCE_RAD_PER_NM = 1e-7  # of every joint; only the shape of a deflection matters, not its size
+_RIGID = 6  # degrees of freedom of a base
 _FRAME_ORIGIN = re.compile(r"frame\d+_[xyz]_mm")
 _PLACE = re.compile(r"(frame\d+|prism)_[xyz]_mm")
 
@@ -37,9 +37,9 @@ class Features:
         geometry: (n, g) joint values (deg or mm), frame origins and the prism in the base frame (mm); never missing.
         signals: (n, s) optional columns of the observations, joint torques and estimates of other learners; NaN where
             not measured.
-        joint_jacobian: (n, 3, joints) how an error of each joint moves the prism in the base frame, mm per deg or mm.
-        parameter_jacobian: (n, 3, p) the same of each constant of rows and prisms, and of shifting and turning the
-            base along and about its own axes, whatever the set-up; mm per mm or rad.
+        joint_jacobian: (n, 3, joints) derivative of the prism in the base frame by each joint, mm per deg or mm.
+        parameter_jacobian: (n, 3, p) derivative by each constant of rows and prisms, and by shifts along and turns
+            about the axes of the base, independent of the set-up; mm per mm or rad.
     """
 
     names: tuple[str, ...]
@@ -52,15 +52,15 @@ class Features:
         return len(self.geometry)
 
     def table(self) -> Floats:
-        """(n, g + s) columns."""
+        """Return all (n, g + s) columns."""
         return np.concatenate([self.geometry, self.signals], axis=1)
 
     def columns(self, names: Sequence[str]) -> Floats:
-        """(n, k) columns of these names; ValueError for one that is not there."""
+        """Return the (n, k) columns with these names; raise ValueError if one does not exist."""
         return self.table()[:, column_places(self.names, tuple(names))]
 
     def select(self, rows: NDArray[np.bool_] | NDArray[np.intp]) -> Features:
-        """Rows by mask or by index."""
+        """Return rows by mask or by index."""
         return replace(
             self,
             geometry=self.geometry[rows],
@@ -76,15 +76,15 @@ class Features:
 
 @lru_cache(maxsize=64)
 def column_places(names: tuple[str, ...], wanted: tuple[str, ...]) -> NDArray[np.intp]:
-    """Find the wanted names among all; ValueError for one that is not there.
+    """Return the indices of the wanted names among all; raise ValueError if one does not exist.
 
-    A learner asks for the same ones with each prediction.
+    Results are cached, as a learner asks for the same columns with each prediction.
     """
     return np.array([names.index(name) for name in wanted], dtype=np.intp)
 
 
 def usable_signals(observations: Observations) -> tuple[str, ...]:
-    """Names of optional columns that vary and are measured in at least half of the rows."""
+    """Return the names of optional columns that vary and are measured in at least half of the rows."""
 
     def is_usable(values: Floats) -> bool:
         measured = values[np.isfinite(values)]
@@ -95,7 +95,13 @@ def usable_signals(observations: Observations) -> tuple[str, ...]:
 
 
 def usable_torques(chain: Chain, x: Floats, observations: Observations) -> tuple[str, ...]:
-    """Names `torque_<joint>_Nm`, `torque_<joint>_N` of the loads that are known in every row and vary."""
+    """Return names `torque_<joint>_Nm` or `torque_<joint>_N` of the loads that are known in every row and vary.
+
+    Args:
+        chain: kinematics.
+        x: (p,) parameters of the chain.
+        observations: the rows.
+    """
     torques = gravity_torques(chain, x, observations)
     known = np.isfinite(torques).all(axis=0)
     loads = np.where(known, torques, 0.0)
@@ -104,13 +110,16 @@ def usable_torques(chain: Chain, x: Floats, observations: Observations) -> tuple
 
 
 def usable_loads(chain: Chain, x: Floats, observations: Observations) -> tuple[str, ...]:
-    """Names of loads that are known and vary, and of the deflection that they would make."""
+    """Return the names of loads that are known and vary, and of the deflection that they cause if any is a torque.
+
+    Arguments as `usable_torques`.
+    """
     torques = usable_torques(chain, x, observations)
     return (*torques, *DEFLECTION) if any(name.endswith("_Nm") for name in torques) else torques
 
 
 def missing_signals(rig: Rig, observations: Observations, signals: Sequence[str]) -> tuple[str, ...]:
-    """Names of signals that the observations have in no row; loads are computed wherever the rig has masses."""
+    """Return the names of signals without a value in any row; loads count as present if the rig has masses."""
     sources = {column: f"{joint.name}_Nm" for column, joint in zip(torque_columns(rig), rig.joints, strict=True)}
     found: list[str] = []
     for name in signals:
@@ -129,7 +138,7 @@ def _feature_names(rig: Rig, signals: Sequence[str]) -> tuple[str, ...]:
 
 
 def no_features(chain: Chain, signals: Sequence[str]) -> Features:
-    """Features of no row, with the columns of a chain's."""
+    """Return features of zero rows, with the columns for a chain."""
     names, joints = _feature_names(chain.rig, signals), len(chain.rig.joints)
     return Features(
         names,
@@ -141,22 +150,22 @@ def no_features(chain: Chain, signals: Sequence[str]) -> Features:
 
 
 def is_frame_origin(name: str) -> bool:
-    """True for a coordinate of a frame's origin."""
+    """Return True for a coordinate of a frame's origin."""
     return _FRAME_ORIGIN.fullmatch(name) is not None
 
 
 def is_place(name: str) -> bool:
-    """True for a coordinate of a frame's origin or of the prism, which follow from the joints."""
+    """Return True for a coordinate of a frame's origin or of the prism, which follow from the joints."""
     return _PLACE.fullmatch(name) is not None
 
 
 class Extractor:
-    """Function from rows of observations to features; build it once for a model.
+    """Computes features of observations; build it once for a model.
 
     Args:
         chain: the identified kinematics.
-        x: (p,) their parameters.
-        signals: optional columns to use, joint torques among them; one that is absent is NaN throughout.
+        x: (p,) parameters of the kinematics.
+        signals: optional columns to use, including joint torques; a column that is absent is filled with NaN.
     """
 
     def __init__(self, chain: Chain, x: Floats, signals: Sequence[str]) -> None:
@@ -174,8 +183,8 @@ class Extractor:
         """Compute the features of n rows.
 
         Args:
-            readings: (n, joints) deg or mm, where the effects have them.
-            located: the rows there, with the Jacobian by parameters.
+            readings: (n, joints) deg or mm, as corrected by the effects.
+            located: frames and Jacobians at these readings, including the Jacobian by parameters.
             extra: optional columns of the rows.
         """
         n, signals = len(readings), len(self._source)
@@ -207,7 +216,7 @@ class Extractor:
 
 @part()
 def _deflection(by_joint: Floats, loads: Floats, deg_per_nm: Floats) -> float:
-    """Displacement of one coordinate by joints that give way."""
+    """Return the displacement of one coordinate by joints that yield to their loads."""
     moved = 0.0
     for j in range(len(loads)):
         if math.isfinite(loads[j]):
@@ -217,7 +226,7 @@ def _deflection(by_joint: Floats, loads: Floats, deg_per_nm: Floats) -> float:
 
 @part()
 def _rigid(place: Floats, out: Floats) -> None:
-    """Fill `out` (3, 6) with how shifts along the base frame's axes and turns about them move a place."""
+    """Fill `out` (3, 6) with the derivatives of a position by shifts along and turns about the base frame's axes."""
     out[:] = 0.0
     for axis in range(3):
         one, other = (axis + 1) % 3, (axis + 2) % 3
@@ -242,9 +251,9 @@ def _fill(
 ) -> None:
     """Fill `geometry`, `signals` and `parameters`, the Jacobian, of a `Features` of n rows.
 
-    `frames` to `by_parameter` are as a `Located` has them; `loads` (n, joints) N m or N are NaN where not known, as if
-    there were none; `deg_per_nm` (joints,) is by how much each joint gives way to its load. `source` (s,) tells where
-    each signal is among the `measured` columns (m, n), the loads and the three coordinates of the deflection.
+    `frames` to `by_parameter` are fields of a `Located`. `loads` (n, joints), N m or N, are NaN where not known, and
+    then cause no deflection. `deg_per_nm` (joints,) is the compliance of each joint. `source` (s,) is the index of each
+    signal among the `measured` columns (m, n), the loads and the three coordinates of the deflection, in this order.
     """
     joints, places, first = readings.shape[1], frames.shape[1] - 1, parameters.shape[2] - _RIGID
     for n in range(len(readings)):

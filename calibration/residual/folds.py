@@ -1,4 +1,4 @@
-"""Grouped folds: rows that know of each other are never on both sides of a split."""
+"""Grouped folds: rows with dependent errors are never on both sides of a split."""
 
 from __future__ import annotations
 
@@ -12,12 +12,13 @@ Integers = NDArray[np.intp]
 
 
 def group_labels(observations: Observations) -> NDArray[np.str_]:
-    """(n,) labels that follow how the data were taken, with all fixes of one standstill in a single group.
+    """Return (n,) group labels that reflect how the data were taken, with all fixes of a standstill in one group.
 
-    Groups are sessions or set-ups where there are several, else stretches of the path that the poses follow, else cells
-    of the workspace. Fixes of a standstill share the random errors of the readings: a learner that sees one of them
-    "predicts" the others. Among the groups of a standstill's fixes it is the one that fewest standstills have: the cell
-    of a prism that stands still while the joints beyond it are swept would tie the whole sweep together.
+    Groups are sessions or set-ups if there are several, else stretches of the path that the poses follow, else cells of
+    the workspace. Fixes of a standstill share the random errors of the readings, so a learner that has seen one of them
+    "predicts" the others. If the fixes of a standstill are in several groups, all are put in the group with the fewest
+    standstills: the cell of a prism that does not move while the joints beyond it are swept would otherwise join the
+    whole sweep.
     """
     if len(observations) == 0:
         return np.zeros(0, dtype=np.str_)
@@ -25,9 +26,10 @@ def group_labels(observations: Observations) -> NDArray[np.str_]:
 
 
 def neighbour_labels(observations: Observations) -> NDArray[np.str_]:
-    """(n,) labels of stretches of a path or of cells, as `group_labels` has them within each session and set-up.
+    """Return (n,) labels of stretches or cells as in `group_labels`, but within each session and set-up.
 
-    What a fit leaves out together to see how it does on new poses; without all fixes of a set-up it has no base there.
+    A fit that is tested on new poses leaves out these groups. It cannot leave out all fixes of a set-up, as it would
+    then not know the base there.
     """
     if len(observations) == 0:
         return np.zeros(0, dtype=np.str_)
@@ -36,7 +38,7 @@ def neighbour_labels(observations: Observations) -> NDArray[np.str_]:
 
 
 def _by_standstill(labels: NDArray[np.str_], observations: Observations) -> NDArray[np.str_]:
-    """(n,) labels with one for all fixes of a standstill: the one that fewest standstills have."""
+    """Return (n,) labels with the same one for all fixes of a standstill: the one with the fewest standstills."""
     standstill = _standstills(observations)
     known, group = np.unique(labels, return_inverse=True)
     pairs = np.unique(np.column_stack([standstill, group]), axis=0)
@@ -47,9 +49,9 @@ def _by_standstill(labels: NDArray[np.str_], observations: Observations) -> NDAr
 
 
 def standstill_labels(observations: Observations) -> NDArray[np.str_]:
-    """(n,) labels of fixes whose errors hang together: of one standstill, or of one stretch or cell while moving.
+    """Return (n,) labels of fixes with dependent errors: of one standstill, or of one stretch or cell while moving.
 
-    What a test over fixes may take for one draw, whatever the number of prisms at a standstill.
+    A statistical test over fixes counts each label as one independent draw, whatever the number of prisms.
     """
     place = np.where(observations.pose != "", np.char.add("pose ", observations.pose), _places(observations))
     within = np.char.add(np.char.add(observations.setup, "|"), np.char.add(observations.session, "|"))
@@ -57,7 +59,7 @@ def standstill_labels(observations: Observations) -> NDArray[np.str_]:
 
 
 def _places(observations: Observations) -> NDArray[np.str_]:
-    """(n,) stretches of a path, else cells of the workspace."""
+    """Return (n,) stretches of a path, or cells of the workspace if there is no path."""
     stretch = _stretches(observations)
     if stretch is None:
         return np.char.add("cell ", observations.cells(cell_mm(observations.position_mm, observations.setup)))
@@ -65,7 +67,7 @@ def _places(observations: Observations) -> NDArray[np.str_]:
 
 
 def _as_taken(observations: Observations) -> NDArray[np.str_]:
-    """(n,) sessions or set-ups where there are several, else stretches of a path, else cells of the workspace."""
+    """Return (n,) sessions or set-ups if there are several, else stretches of a path, else cells of the workspace."""
     stretch = None
     if not any(len(np.unique(labels)) > 1 for labels in (observations.session, observations.setup)):
         stretch = _stretches(observations)
@@ -73,7 +75,7 @@ def _as_taken(observations: Observations) -> NDArray[np.str_]:
 
 
 def _stretches(observations: Observations) -> Integers | None:
-    """(n,) `path_stretches` of rows in the order of their times, or as they stand where a time is missing."""
+    """Return (n,) `path_stretches` of rows in the order of time, or in the given order if any time is missing."""
     order = np.arange(len(observations))
     time_s = observations.extra.get("time_s")
     if time_s is not None and np.isfinite(time_s).all():
@@ -87,7 +89,7 @@ def _stretches(observations: Observations) -> Integers | None:
 
 
 def _standstills(observations: Observations) -> Integers:
-    """(n,) numbers of standstills: fixes of one pose, or without a name of the pose those with the same readings."""
+    """Return (n,) numbers of standstills: fixes of one pose, or with the same readings if the pose has no name."""
     track, named = _tracks(observations), observations.pose != ""
     out = same_readings(_readings(observations), track)
     pose = np.unique(observations.pose, return_inverse=True)[1].reshape(-1)
@@ -101,13 +103,19 @@ def _readings(observations: Observations) -> Floats:
 
 
 def _tracks(observations: Observations) -> Integers:
-    """(n,) number of each row's session and set-up."""
+    """Return the (n,) number of each row's session and set-up."""
     labels = np.column_stack([observations.session, observations.setup])
     return np.asarray(np.unique(labels, axis=0, return_inverse=True)[1].reshape(-1), dtype=np.intp)
 
 
 def folds(groups: NDArray[np.str_], count: int, seed: int) -> Integers:
-    """(n,) fold of every row: whole groups, dealt at random to the fold that has the fewest rows so far."""
+    """Return the (n,) fold of every row; groups are assigned whole, at random, to the fold with the fewest rows.
+
+    Args:
+        groups: (n,) label of each row's group.
+        count: number of folds; fewer if there are fewer groups.
+        seed: seed of the assignment.
+    """
     labels, index, size = np.unique(groups, return_inverse=True, return_counts=True)
     count = min(count, len(labels))
     fold = np.zeros(len(labels), dtype=np.intp)

@@ -1,7 +1,7 @@
-"""The learners of the residual by kind: how each is read, and the chain of network and trees.
+"""The learners of the residual by kind, their loaders, and the chain of network and trees.
 
-The chain is Zhou et al. 2022's: trees see the network's estimate as further features. In training it is the
-*out-of-fold* estimate, so that the trees never lean on what the network has memorised.
+The chain follows Zhou et al. 2022: trees receive the network's estimate as additional features. In training this is
+the *out-of-fold* estimate, so that the trees do not rely on what the network has memorised.
 """
 
 from __future__ import annotations
@@ -33,18 +33,18 @@ class Residual(Protocol):
         """`rbfn`, `lightgbm`, `chain`, `gp` or `rbf-tcm`."""
 
     def predict(self, features: Features) -> Floats:
-        """(n, 3) estimate of the residual in the base frame, mm."""
+        """Return the (n, 3) estimate of the residual in the base frame, mm."""
 
     def fits(self, features: Features) -> bool:
-        """True if it was trained on the columns that these features have."""
+        """Return True if the features have the columns on which the learner was trained."""
 
     def to_files(self) -> dict[str, bytes]:
-        """Return file name -> content of what is needed to predict again."""
+        """Return file name -> content of the files from which the learner can be restored."""
 
 
 @dataclass(frozen=True)
 class Chained:
-    """Network, then trees that see its estimate."""
+    """A network, followed by trees that have its estimate as features."""
 
     kind: ClassVar[str] = "chain"
 
@@ -52,21 +52,21 @@ class Chained:
     boosting: Boosting
 
     def predict(self, features: Features) -> Floats:
-        """(n, 3) estimate of the residual in the base frame, mm."""
+        """Return the (n, 3) estimate of the residual in the base frame, mm."""
         return self.boosting.predict(with_estimate(features, self.rbfn.predict(features)))
 
     def fits(self, features: Features) -> bool:
-        """True if both parts fit."""
+        """Return True if both parts fit."""
         estimate = np.empty((len(features), len(_NETWORK_SIGNALS)))
         return self.rbfn.fits(features) and self.boosting.fits(with_estimate(features, estimate))
 
     def to_files(self) -> dict[str, bytes]:
-        """The files of both."""
+        """Return the files of both parts."""
         return self.rbfn.to_files() | self.boosting.to_files()
 
     @classmethod
     def from_files(cls, files: Mapping[str, bytes]) -> Chained:
-        """Inverse of `to_files`."""
+        """Restore a chain from `to_files`."""
         return cls(Rbfn.from_files(files), Boosting.from_files(files))
 
 
@@ -76,13 +76,13 @@ LOADERS: Mapping[str, Callable[[Mapping[str, bytes]], Residual]] = {
 
 
 def tree_importance(residual: Residual | None) -> tuple[Importance, ...] | None:
-    """Features of the learner's trees, the most important first; None without trees."""
+    """Return the features of the learner's trees, the most important first; None without trees."""
     trees = residual.boosting if isinstance(residual, Chained) else residual
     return trees.importance if isinstance(trees, Boosting) else None
 
 
 def with_estimate(features: Features, estimate_mm: Floats) -> Features:
-    """Append a network's estimate (n, 3) to the features, as the chain's trees see them."""
+    """Append a network's estimate (n, 3), mm, to the features, for the trees of a chain."""
     return features.with_signals(_NETWORK_SIGNALS, estimate_mm)
 
 
@@ -94,9 +94,9 @@ def with_out_of_fold_estimate(
     Args:
         features: n training rows.
         target_mm: (n, 3) residuals in the base frame.
-        labels: (n,) no fold separates rows of one.
-        shape: of the networks.
-        seed: of folds and networks.
+        labels: (n,) labels; no fold separates rows with the same one.
+        shape: shape of the networks.
+        seed: seed of folds and networks.
     """
     out = np.empty_like(target_mm)
     split = folds(labels, _INNER_FOLDS, seed + 1)

@@ -1,10 +1,11 @@
-"""The region that a residual was trained on: outside it the estimate fades to zero, and the model says so.
+"""The region in which a residual learner was trained: outside it the estimate fades to zero, with a warning.
 
-Three things make a row strange. A joint beyond the readings it was trained with; a pose that is farther from all
-trained poses than those on which cross-validation has shown that the learner helps; and a signal that reads what it
-never read, as at another site, under another load, or where a sensor has shifted. In all three the estimate fades to
-zero. A missing signal is replaced by its usual value, and the estimate counts for less by as much as it gained from
-that signal. All weights are smooth: a rig that moves out of the region sees no step.
+A row is outside the region for one of three reasons: a joint reads beyond the range of the training data; the pose is
+farther from all training poses than those on which cross-validation has shown that the learner helps; or a signal
+is outside its range in training, as at a different site, under a different load, or after a sensor has shifted. In all
+three cases the estimate fades to zero. A missing signal is replaced by its usual value, and the weight of the estimate
+is reduced by the share of the gain that depends on that signal. All weights are continuous, so that the estimate does
+not jump as a rig moves out of the region.
 """
 
 from __future__ import annotations
@@ -29,18 +30,18 @@ _CENTRE, _HALF, _MARGIN, _SCALE, _TURN = range(5)
 # Rows of the table of signals, in the signal's unit; LOSS is a share and GAPS 0 or 1.
 _LOW, _HIGH, _ROOM, _USUAL, _LOSS, _GAPS = range(6)
 
-_MARGIN_SHARE = 0.1  # of a range, that readings may leave it before anything fades
+_MARGIN_SHARE = 0.1  # of a range; by that much readings may leave it before the estimate fades
 _LEAST_MARGIN = {"revolute": 1.0, "prismatic": 10.0}  # deg, mm
 _POSES = 256
-_MOST_ROWS = 5000  # that representatives are chosen from
-_QUANTILE = 0.99  # of the held-out rows are no farther from trained poses than "near"
-_NEAR_FACTOR = 1.25  # in that distance
+_MOST_ROWS = 5000  # from which representatives are chosen
+_QUANTILE = 0.99  # of the held-out rows' distances from trained poses, which defines "near"
+_NEAR_FACTOR = 1.25  # on that distance
 _LEAST_NEAR = 0.02  # in ranges of the joints
-_OFTEN_MISSING = 0.05
-_PROBED = 500  # rows that tell what a signal matters
-_FADE = 2.0  # margins beyond the margin until nothing is left
-_NOTABLE = 0.01  # of a residual's gain; signals that matter less are not spoken of
-_FADED = 0.9  # weights above are not spoken of
+_OFTEN_MISSING = 0.05  # share of training rows without a signal, above which its absence is normal
+_PROBED = 500  # rows on which the importance of signals is measured
+_FADE = 2.0  # margins beyond the margin, over which the weight falls to zero
+_NOTABLE = 0.01  # of a residual's gain; signals that matter less are not reported
+_FADED = 0.9  # weights above this are not reported
 
 
 @dataclass(frozen=True)
@@ -48,13 +49,13 @@ class Region:
     """The region of a learner.
 
     Attributes:
-        joints: (5, j) centre and half of each joint's trained range, margin, scale of distances (deg or mm), and 360
-            for angles whose whole turns change nothing or 0.
+        joints: (5, j) centre and half width of each joint's range in training, margin, scale of distances (deg or mm),
+            and 360 for angles whose whole turns change nothing, else 0.
         poses: (m, j) representative readings.
-        near: distance to the nearest of them, in scales of the joints, up to which the estimate counts in full.
+        near: distance to the nearest representative pose, in scales of the joints, up to which the weight is 1.
         signals: names of the s signal columns.
-        table: (6, s) lowest, highest, margin and usual value of each, share of the gain that is lost without it, and
-            whether training rows lacked it as well, 0 or 1.
+        table: (6, s) lowest, highest, margin and usual value of each signal, share of the gain that is lost without it,
+            and whether training rows lacked it as well, 0 or 1.
     """
 
     joints: Floats
@@ -64,20 +65,21 @@ class Region:
     table: Floats
 
     def confine(self, features: Features) -> tuple[Features, Floats]:
-        """Bring features into the region, and weigh the estimate there.
+        """Bring features into the region and compute the weight of the estimate in each row.
 
         Args:
-            features: n rows with the columns that the region was fitted to.
+            features: n rows with the columns with which the region was fitted.
 
         Returns:
-            Features with angles less whole turns, and strange signals at their usual values; (n,) weights, 0 to 1.
+            Features with whole turns removed from angles and with signals out of range at their usual values; and the
+            (n,) weights, 0 to 1.
         """
         geometry, signals = features.geometry.copy(), features.signals.copy()
         weight = _confine(self.joints, self.poses, self.near, self.table, geometry, signals)
         return replace(features, geometry=geometry, signals=signals), weight
 
     def warnings(self, features: Features, joints: Sequence[Joint]) -> Iterator[str]:
-        """Warn of rows outside the region, and of signals that are not what they were in training."""
+        """Yield warnings about rows outside the region, and about signals out of their range in training."""
         if len(features) == 0:
             return
         for name, values, (low, high, room, _, _, _) in self._notable(features):
@@ -91,13 +93,13 @@ class Region:
         faded = int((weight < _FADED).sum())
         if faded:
             yield (
-                f"the residual fades: {faded} of {len(weight)} rows lie outside the region it was trained on "
+                f"the residual fades: {faded} of {len(weight)} rows lie outside the region of its training data "
                 f"({', '.join(self._reasons(features, joints))}); {int((weight == 0.0).sum())} rows "
-                f"({(weight == 0.0).mean():.0%}) get none of it"
+                f"({(weight == 0.0).mean():.0%}) are not corrected at all"
             )
 
     def _notable(self, features: Features) -> Iterator[tuple[str, Floats, Floats]]:
-        """Name, values and column of the table of each signal that matters."""
+        """Yield name, values and column of the table of each signal that matters."""
         for k in np.flatnonzero(self.table[_LOSS] >= _NOTABLE):
             yield self.signals[k], features.signals[:, k], self.table[:, k]
 
@@ -119,12 +121,12 @@ class Region:
             yield f"far from every trained pose in {far}"
         for name, values, (low, high, room, _, _, gaps) in self._notable(features):
             missing, outside = ~np.isfinite(values) & (gaps == 0.0), (values < low - room) | (values > high + room)
-            for what, rows in (("missing", missing), ("strange", outside)):
+            for what, rows in (("missing", missing), ("out of range", outside)):
                 if rows.any():
                     yield f"{name} {what} in {int(rows.sum())}"
 
     def fits(self, joints: int) -> bool:
-        """True if its tables have the shapes and the numbers that `confine` relies on."""
+        """Return True if the tables have the shapes and values on which `confine` relies."""
         return (
             self.joints.shape == (5, joints)
             and self.poses.ndim == 2
@@ -141,18 +143,18 @@ class Region:
         )
 
     def to_files(self) -> dict[str, bytes]:
-        """One npz file without pickled objects."""
+        """Return one npz file without pickled objects."""
         parts = {"joints": self.joints, "poses": self.poses, "near": np.array([self.near]), "table": self.table}
         return {_FILE: write_npz({**parts, "signals": np.array(self.signals, dtype=np.str_)})}
 
     @classmethod
     def from_files(cls, files: Mapping[str, bytes]) -> Region:
-        """Inverse of `to_files`; KeyError or ValueError where parts are missing. `fits` says whether they match."""
+        """Restore from `to_files`; KeyError or ValueError if parts are missing. `fits` checks whether they match."""
         stored = read_npz(files[_FILE])
         joints, poses, near, table = (float_array(stored, k) for k in ("joints", "poses", "near", "table"))
         signals = np.asarray(stored["signals"])
         if near.shape != (1,) or signals.ndim != 1 or signals.dtype.kind != "U":
-            raise ValueError(f"{_FILE} holds no list of signals, or not one distance")
+            raise ValueError(f"{_FILE} lacks a list of signals or a single distance")
         return cls(joints, poses, float(near[0]), tuple(signals.tolist()), table)
 
 
@@ -165,16 +167,16 @@ def fit_region(
     predict: Callable[[Features], Floats],
     gain_mm2: float,
 ) -> Region:
-    """Find the region of a learner.
+    """Determine the region of a learner.
 
     Args:
-        features: n rows that it was trained on.
-        joints: of the rig, whose readings are the first columns.
+        features: n training rows of the learner.
+        joints: joints of the rig, whose readings are the first columns.
         turns: (j,) 360 for joints whose whole turns change nothing, else 0.
         signals: names of the signal columns.
-        split: (n,) fold that held each row out when the learner was found to help.
-        predict: (n, 3) estimates of the learner for features.
-        gain_mm2: by how much it lowered the mean squared error of held-out rows.
+        split: (n,) fold that held each row out in cross-validation of the learner.
+        predict: function from features to the learner's estimates (n, 3), mm.
+        gain_mm2: reduction of the mean squared error of held-out rows by the learner.
     """
     readings = features.geometry[:, : len(joints)]
     low, high = readings.min(axis=0), readings.max(axis=0)
@@ -192,7 +194,7 @@ def fit_region(
 
 
 def _representatives(scaled: Floats) -> NDArray[np.intp]:
-    """Rows that lie as far apart as can be, each next the farthest from those before (Gonzalez 1985), 256 at most."""
+    """Choose up to 256 rows far apart from each other: each is the farthest from those before (Gonzalez 1985)."""
     offered = np.unique(np.linspace(0, len(scaled) - 1, min(len(scaled), _MOST_ROWS)).astype(np.intp))
     points = scaled[offered]
     chosen = [int(((points - points.mean(axis=0)) ** 2).sum(axis=1).argmin())]
@@ -204,7 +206,7 @@ def _representatives(scaled: Floats) -> NDArray[np.intp]:
 
 
 def _usual_distance(scaled: Floats, split: NDArray[np.intp]) -> float:
-    """Distance of held-out rows from the representatives of the others, 99 % quantile."""
+    """Return the 99 % quantile of the distance of held-out rows from the representatives of the other rows."""
     found = []
     for fold in np.unique(split):
         training, held = scaled[split != fold], scaled[split == fold]
@@ -215,7 +217,7 @@ def _usual_distance(scaled: Floats, split: NDArray[np.intp]) -> float:
 
 
 def _signal_table(features: Features, predict: Callable[[Features], Floats], gain_mm2: float) -> Floats:
-    """(6, s) of `Region.table`."""
+    """Return `Region.table` (6, s)."""
     signals = features.signals
     count = signals.shape[1]
     if count == 0:
@@ -234,7 +236,7 @@ def _signal_table(features: Features, predict: Callable[[Features], Floats], gai
         return float(((predict(replace(probe, signals=replaced)) - with_all) ** 2).sum(axis=1).mean())
 
     cost = np.array([cost_mm2(np.array([k])) for k in range(count)])
-    # Signals that stand in for each other cost little one by one, and much together.
+    # Signals that can replace each other cost little one by one, but much together.
     together = cost_mm2(np.arange(count)) / max(float(cost.sum()), 1e-12)
     share = cost * max(1.0, together) / max(gain_mm2, 1e-12)
     return np.array([low, high, room, usual, np.minimum(share, 1.0), gaps.astype(float)])
@@ -255,7 +257,7 @@ def _falling(excess: float) -> float:
 
 @part()
 def _short_way(change: float, turn: float) -> float:
-    """A change of an angle without the whole turns in it; other values, whose turn is 0, as they are."""
+    """Return a change of an angle without whole turns; other values, whose turn is 0, are returned unchanged."""
     if turn > 0.0 and 2.0 * abs(change) > turn:
         return change - turn * math.floor(change / turn + 0.5)
     return change
@@ -263,7 +265,7 @@ def _short_way(change: float, turn: float) -> float:
 
 @part()
 def _joint_weight(joints: Floats, row: int, readings: Floats) -> float:
-    """Weight by the ranges of the joints; readings beyond theirs are taken on the turn nearest its centre."""
+    """Return the weight by the ranges of the joints; readings beyond them are moved to the turn nearest the centre."""
     weight = 1.0
     for k in range(joints.shape[1]):
         away = readings[row, k] - joints[_CENTRE, k]
@@ -278,7 +280,7 @@ def _joint_weight(joints: Floats, row: int, readings: Floats) -> float:
 
 @part()
 def _nearness(joints: Floats, poses: Floats, near: float, row: int, readings: Floats) -> float:
-    """Weight by the distance to the nearest of the poses: 1 up to `near`, nothing from twice that on."""
+    """Return the weight by the distance to the nearest pose: 1 up to `near`, falling to 0 at twice that."""
     least = 4.0 * near * near
     for m in range(len(poses)):
         square = 0.0
@@ -296,10 +298,10 @@ def _nearness(joints: Floats, poses: Floats, near: float, row: int, readings: Fl
 
 @part()
 def _signal_weight(table: Floats, row: int, signals: Floats) -> float:
-    """Weight by the signals; what is missing or out of range is drawn to its usual value.
+    """Return the weight by the signals, and move missing or out-of-range signals towards their usual values.
 
-    A missing signal costs the share of the gain that goes with it. A strange one that matters leaves nothing: what made
-    it strange, another site or load, has not been seen to leave the rest of the estimate right.
+    A missing signal costs its share of the gain. A signal that matters and is far out of range sets the weight to zero:
+    its cause, such as a different site or load, may invalidate the rest of the estimate as well.
     """
     lost, trusted = 0.0, 1.0
     for k in range(table.shape[1]):
@@ -319,9 +321,9 @@ def _signal_weight(table: Floats, row: int, signals: Floats) -> float:
 
 @compiled
 def _confine(joints: Floats, poses: Floats, near: float, table: Floats, readings: Floats, signals: Floats) -> Floats:
-    """Weigh a residual in each row, (n,) from 0 to 1, and bring readings and signals into its region in place.
+    """Return the (n,) weights of a residual, 0 to 1, and bring readings and signals into its region in place.
 
-    `joints`, `poses`, `near` and `table` are those of a `Region`; joints are in the first columns of `readings`.
+    `joints`, `poses`, `near` and `table` are fields of a `Region`. Joints are in the first columns of `readings`.
     """
     weight = np.empty(len(readings))
     for row in range(len(readings)):

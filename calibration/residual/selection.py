@@ -1,6 +1,6 @@
-"""Selection of the residual learner: candidates compared by cross-validation, the best kept if it helps beyond chance.
+"""Selection of the residual learner: the best candidate in cross-validation is kept if it helps significantly.
 
-Every learner is judged by its out-of-fold estimates: those of rows that it was not trained on.
+Every learner is judged by its out-of-fold estimates, for rows on which it was not trained.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ from calibration.residual.gaussian.process import fit_gaussian_process
 from calibration.residual.learners import Chained, Residual, with_out_of_fold_estimate
 from calibration.residual.rbf.rbfn import fit_shape
 from calibration.residual.rbf.torque_network import TorqueNetwork, fit_torque_network
-from calibration.residual.trees.boosting import Settings, Tuned, fit_boosting
+from calibration.residual.trees.boosting import BoostingSettings, Tuned, fit_boosting
 
 Kind = Literal["default", "none", "rbfn", "lightgbm", "chain", "gp"]
 Labels = NDArray[np.str_]
 
 _FOLDS = 5
-_FEW_ROWS, _MORE_FOLDS = 600, 10  # where folds' learners have too few rows to tell what all of them will leave
+_FEW_ROWS, _MORE_FOLDS = 600, 10  # below so many rows, more folds predict the error of a learner of all rows better
 _LEAST_ROWS = 50
 _LEAST_UNITS = 10
-_MOST_GAIN = 2.0  # of the squared error that may be hoped to go, for each part of the rows that folds leave out
-_REACH = 1.5  # in error; the chain of Zhou et al. 2022 gains a quarter on the better of its parts
-_OUT_OF_REACH, _BEHIND = 1.6, 1.02  # in error on two folds of few and of many rows: who is so far behind has lost
+_MOST_GAIN = 2.0  # largest extrapolated share of gain in squared error, per share of rows that a fold leaves out
+_REACH = 1.5  # ratio of errors; the chain of Zhou et al. 2022 gains a quarter over the better of its parts
+_OUT_OF_REACH, _BEHIND = 1.6, 1.02  # ratios of errors on two folds, for few and many rows, beyond which to discard
 _MOST_PROGRESS = 0.95
 
 
@@ -43,11 +43,11 @@ class Trial:
     """Result of one learner on held-out groups.
 
     Attributes:
-        kind: which learner.
+        kind: kind of the learner.
         before_mm: RMS of the 3-D error without it.
         after_mm: RMS of the 3-D error with it.
         p: probability of such a gain by chance (paired one-sided t-test over groups).
-        kept: it passed.
+        kept: whether the learner passed the test.
     """
 
     kind: str
@@ -62,13 +62,13 @@ class Selection:
     """Result of `select_residual`.
 
     Attributes:
-        residual: the learner, fitted to all rows; None where none helps.
-        trials: the learners that were compared.
-        reason: one sentence.
-        left_mm: (n, 3) errors of rows that the learner was trained without; the targets themselves without a learner.
+        residual: the learner, fitted to all rows; None if no learner helps.
+        trials: results of the learners that were compared.
+        reason: one sentence about the decision.
+        left_mm: (n, 3) out-of-fold errors of the learner; the targets themselves without a learner.
         split: (n,) fold that held each row out; all zero without a learner.
-        variance_mm2: (3,) expected squared error of the learner on rows it never saw, along the axes of the base
-            frame; zeros without a learner.
+        variance_mm2: (3,) expected squared error of the learner on new rows, along the axes of the base frame; zeros
+            without a learner.
     """
 
     residual: Residual | None
@@ -92,19 +92,18 @@ def select_residual(
 ) -> Selection:
     """Compare the candidates and fit the best one that helps.
 
-    The expected error is the winner's own out-of-fold error, the least of up to four on the same rows: a little less
-    than new rows will show, most so where the learners are about as good as each other.
+    The expected error is the out-of-fold error of the selected learner, the least of up to four on the same rows. It is
+    therefore slightly lower than the error on new rows, especially if the learners are about equally good.
 
     Args:
         features: n rows.
         target_mm: (n, 3) residuals in the base frame.
-        groups: (n,) labels that no fold separates.
-        standstills: (n,) finer labels (`standstill_labels`), the units of the test where the groups are too few for
-            one.
-        kind: one learner, or `default` for whichever is best.
-        seed: of folds and learners.
-        executor: runs what is independent; the selection does not depend on it.
-        progress: told the share that is done.
+        groups: (n,) labels; no fold separates rows with the same one.
+        standstills: (n,) finer labels (`standstill_labels`), the units of the test if there are too few groups.
+        kind: one learner, or `default` for the best.
+        seed: seed of folds and learners.
+        executor: runs independent work; the selection does not depend on it.
+        progress: called with the share of the work that is done.
     """
     if kind == "none":
         return _nothing(target_mm, (), "switched off")
@@ -124,7 +123,7 @@ def select_residual(
             continue
         if estimates and (name != "chain" or len(features) >= MANY_ROWS):
             best_mm = min((found for found, _ in estimates.values()), key=lambda found: _squares(target_mm - found))
-            probed, probe_mm = validation.probe(name, tuned.settings if tuned else Settings())
+            probed, probe_mm = validation.probe(name, tuned.settings if tuned else BoostingSettings())
             if _squares(target_mm[probed] - probe_mm) > _reach(name, len(features)) ** 2 * _squares(
                 (target_mm - best_mm)[probed]
             ):
@@ -146,7 +145,7 @@ def select_residual(
     residual = _fit(best.kind, data, tuned, validation.shared, seed, executor)
     progress(1.0)
     if residual is None:
-        return _nothing(target_mm, compared, _left_out(kind, "all rows together show nothing to learn"))
+        return _nothing(target_mm, compared, _left_out(kind, "there is nothing to learn in all rows together"))
     return Selection(
         residual,
         compared,
@@ -161,7 +160,7 @@ def select_residual(
 def torque_compensation(
     features: Features, target_mm: Floats, groups: Labels, standstills: Labels, names: Sequence[str], *, seed: int
 ) -> Selection:
-    """Fit the second paper's network on the joint torques, and keep it whether it helps or not, as the paper does.
+    """Fit the second paper's network on the joint torques, and keep it even if it does not help, as the paper does.
 
     Args:
         features: n rows.
@@ -169,7 +168,7 @@ def torque_compensation(
         groups: (n,) as for `select_residual`.
         standstills: (n,) as for `select_residual`.
         names: columns of the torques among the features.
-        seed: of the folds.
+        seed: seed of the folds.
     """
     units = _units(groups, standstills)
     if len(np.unique(units)) < _LEAST_UNITS:
@@ -180,7 +179,7 @@ def torque_compensation(
     return Selection(
         network,
         (trial,),
-        f"a part of the method: {len(network.units)} units on the joint torques bring the error of rows left "
+        f"a part of the method: {len(network.units)} units on the joint torques change the error of rows left "
         f"out from {trial.before_mm:.3g} to {trial.after_mm:.3g} mm RMS",
         left_mm,
         folds(units, _FOLDS, seed),
@@ -197,13 +196,13 @@ def _squares(error_mm: Floats) -> float:
 
 
 def _units(groups: Labels, standstills: Labels) -> Labels:
-    """(n,) labels to test by: groups, or the standstills in them where the groups are too few for a test."""
+    """Return (n,) labels to test by: groups, or the standstills in them if the groups are too few for a test."""
     return groups if len(np.unique(groups)) >= _LEAST_UNITS else np.char.add(np.char.add(groups, "|"), standstills)
 
 
 def _left_out(kind: Kind, reason: str) -> str:
-    """Return the reason why there is no residual, which a learner that was asked for is told by its name."""
-    return reason if kind == "default" else f"{kind} was asked for and is left out: {reason}"
+    """Return the reason why there is no residual; it names the learner if a specific one was requested."""
+    return reason if kind == "default" else f"{kind} was requested and is left out: {reason}"
 
 
 def _no_gain(compared: Sequence[Trial]) -> str:
@@ -226,18 +225,18 @@ def _trial(kind: str, target_mm: Floats, estimate_mm: Floats, units: Labels) -> 
 
 
 def _may_win(trials: Mapping[str, Trial]) -> bool:
-    """True if the chain may be the best: its parts help, and are not out of reach of the best so far.
+    """Return True if the chain may be the best: its network helps, and its trees are not far behind the best so far.
 
-    The estimate of a network that does not help is noise to the trees.
+    To the trees, the estimate of a network that does not help is only noise.
     """
     best = min(trial.after_mm for trial in trials.values())
     return trials["rbfn"].kept and trials["lightgbm"].after_mm < _REACH * best
 
 
 def _reach(kind: str, rows: int) -> float:
-    """Error on two folds, of that of the best learner so far, up to which another one is tried on all of them.
+    """Return the largest ratio to the best learner's error, on two folds, at which a learner is tried on all folds.
 
-    Tuning may still gain much with few rows, where trying costs little. The chain, the most work, must be ahead.
+    With few rows tuning may still gain much, and trying is cheap. The chain, which is the most work, must be ahead.
     """
     if rows < MANY_ROWS:
         return _OUT_OF_REACH
@@ -247,10 +246,10 @@ def _reach(kind: str, rows: int) -> float:
 def _gain_of_all_rows(
     validation: CrossValidation, kind: str, left_mm: Floats, tuned: Tuned | None, executor: Executor
 ) -> float:
-    """Held-out squared error of a learner trained on all rows over that of the folds', trained on some.
+    """Return the expected squared error of a learner trained on all rows, relative to that of the folds' learners.
 
-    Error against one over the number of rows is taken for a straight line through those with half the rows and with
-    all but a fold's. Two folds have no more than half, and nothing is hoped for.
+    The error is assumed to be linear in 1 / number of rows, and extrapolated from training on half of the rows and on
+    all but one fold. With two folds both are the same, so no gain is assumed.
     """
     if validation.count == 2:
         return 1.0

@@ -1,6 +1,6 @@
-"""States of a search as plain arrays, with which it goes on after an interruption.
+"""Checkpoints of a search as plain arrays, from which it resumes after an interruption.
 
-A state names the problem that it belongs to, so that a search of other data, bounds or settings never continues it.
+A state contains a description of its problem, so that a search with other data, bounds or settings never resumes it.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from calibration.run_settings import Checkpoint
 
 Arrays = dict[str, NDArray[Any]]
 
-_FORMAT = "1"  # of the state; another one cannot be continued
-_PROBES = 8
-_SAME = 1e-9
+_FORMAT = "1"  # of the state; states of a different format cannot be resumed
+_PROBES = 8  # candidates whose fitness represents the data
+_SAME = 1e-9  # relative tolerance when numbers are compared
 _PREFIX = "problem."
 
 
@@ -33,10 +33,19 @@ def problem(
     seed: int,
     settings: object,
 ) -> Arrays:
-    """Describe a search such that two are the same if all parts agree; the names of the parts say what differs.
+    """Return a description of a search by named parts; two searches are the same if all parts agree.
 
-    Data are known by their effect: the fitness of a few candidates spread over the box. Numbers that an earlier fit
-    found may differ in their last bits from one process to the next, so they are compared to a billionth.
+    The data are represented by the fitness of a few candidates spread over the box. Results of an earlier fit may
+    differ in their last bits between processes, so numbers are compared with a relative tolerance of 1e-9.
+
+    Args:
+        method: name of the method.
+        fitness: function from (candidates, p) to costs (candidates,).
+        lower: (p,) lower bounds.
+        upper: (p,) upper bounds.
+        start: (k, p) initial candidates, if any.
+        seed: seed of the random numbers.
+        settings: settings of the search; its `repr` is compared.
     """
     steps = (np.arange(_PROBES)[:, None] * (1.0 + np.arange(len(lower))) * 0.6180339887498949 + 0.5) % 1.0
     probes = lower + (upper - lower) * steps
@@ -51,22 +60,22 @@ def problem(
 
 
 def pack(identity: Mapping[str, NDArray[Any]], arrays: Mapping[str, NDArray[Any]]) -> bytes:
-    """Pack arrays and the problem that they belong to, as an npz archive without pickled objects."""
+    """Pack arrays and the description of their problem as an npz archive without pickled objects."""
     return write_npz({_PREFIX + word: value for word, value in identity.items()} | dict(arrays))
 
 
 def unpack(state: bytes | None, identity: Mapping[str, NDArray[Any]]) -> tuple[Arrays | None, str | None]:
-    """Read the arrays of a state of this very problem, or None; a sentence where a state had to be left aside."""
+    """Return the arrays of a state, or None and the reason if it cannot be read or belongs to a different problem."""
     if state is None:
         return None, None
     try:
         arrays = read_npz(state)
     except ValueError:
-        return None, "the checkpoint cannot be read, so the search began anew"
+        return None, "the checkpoint cannot be read, so the search started again"
     found = {word: arrays.pop(_PREFIX + word, np.empty(0)) for word in identity}
     other = [word for word, value in identity.items() if not _same(found[word], value)]
     if other:
-        return None, f"the checkpoint is of another search ({', '.join(other)} differ), so the search began anew"
+        return None, f"the checkpoint is of another search ({', '.join(other)} differ), so the search started again"
     return arrays, None
 
 
@@ -74,13 +83,13 @@ class SavedSearch:
     """The state of a search in a run's checkpoint, if the run has one.
 
     Args:
-        checkpoint: of the run.
+        checkpoint: checkpoint of the run, if any.
         identity: function that returns the `problem`.
 
     Attributes:
-        arrays: state to go on from; None to begin anew.
-        set_aside: reason why a state was not continued; None where there was none or it was.
-        unsaved: reason why a state was not saved; None where each was.
+        arrays: state to resume from; None to start from the beginning.
+        set_aside: reason why an existing state was not resumed, or None.
+        unsaved: reason why a state could not be saved, or None.
     """
 
     def __init__(self, checkpoint: Checkpoint | None, identity: Callable[[], Arrays]) -> None:
@@ -90,14 +99,14 @@ class SavedSearch:
         self.unsaved: str | None = None
 
     def save(self, arrays: Mapping[str, NDArray[Any]]) -> None:
-        """Save a state; that it cannot be saved is no reason to end the search."""
+        """Save a state; a failure is recorded in `unsaved` and does not end the search."""
         if self._checkpoint is None:
             return
         try:
             self._checkpoint.save(pack(self._identity, arrays))
         except OSError as error:
             self.unsaved = (
-                f"the search's checkpoint could not be written ({error}), so a search that is killed may begin anew"
+                f"the search's checkpoint could not be written ({error}), so a search that is killed may start again"
             )
 
 

@@ -1,4 +1,4 @@
-"""The global search: differential evolution within a multiple of the build tolerances, on a part of the data."""
+"""Global search: differential evolution within a multiple of the build tolerances, on a part of the data."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from calibration.kinematics.fitness import Fitness
 from calibration.observations import Floats
 from calibration.run_settings import Run
 
-_SEARCH_ROWS = 400  # enough to tell basins apart
+_SEARCH_ROWS = 400  # enough to distinguish basins of attraction
 _SEARCH_WIDTH = {"recalibration": 4.0, "as-built": 60.0}  # half-width of the search in build tolerances
 _EVALUATIONS_PER_PARAMETER = 200
 
@@ -43,25 +43,25 @@ def search_globally(
     prior: Prior,
     run: Run,
 ) -> tuple[Floats | None, Evolved]:
-    """Look for a start for the refinement that is better than where the local one ended.
+    """Search for a start for the refinement that is better than the local optimum.
 
     Args:
         chain: kinematics.
         samples: rows.
-        nominal: (p,) the middle of the search.
-        local: (p,) the optimum to beat.
-        scale_mm: robust size of the misfit at the middle.
-        prior: gives the width of the search.
-        run: as `evolve`.
+        nominal: (p,) centre of the search.
+        local: (p,) local optimum.
+        scale_mm: robust size of the misfit at the centre.
+        prior: determines the width of the search.
+        run: as for `evolve`.
 
     Returns:
-        (p,) a better start, None where nothing is better than the local fit; the search.
+        A better start (p,), or None if nothing is better than the local optimum; and the result of the search.
     """
     rows = draw_rows(samples.data, samples.position_mm, _SEARCH_ROWS, run.seed)
     searched = samples.select(rows)
     data, position = searched.data, searched.position_mm
     lin = chain.linearise(nominal, data)
-    # Noise far below the misfit would make the basin a needle's eye; the refinement has the true noise.
+    # Noise far below the misfit would make the basin too narrow to find; the refinement uses the true noise.
     variance = searched.variance(chain.rig, lin.joint_jacobian) + (scale_mm / 30.0) ** 2
     weight = np.full(len(rows), 1.0 / variance)
     fitness = Fitness.build(chain, data, position, weight, robust_scale=4.0 * scale_mm / math.sqrt(variance))

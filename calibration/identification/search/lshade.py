@@ -1,10 +1,10 @@
-"""One island of L-SHADE: current-to-pbest/1/bin with archive, scale factor and crossover learned from success.
+"""One island of L-SHADE: current-to-pbest/1/bin with archive; scale factor and crossover rate adapt to success.
 
-A generation is two compiled calls around one evaluation, so that with some eighty candidates an island spends its time
-in the fitness. Names are those of Tanabe and Fukunaga (CEC 2014), and so is the method but for this: crossover rates
-are learned by the arithmetic mean that their earlier SHADE (CEC 2013) has, not by the Lehmer mean, and no memory ends
-at a terminal rate of zero; the archive holds 1.4 candidates for each of the population, not 2.6; the population does
-not grow with the parameters; a trial as costly as its parent is dropped.
+A generation is two compiled calls around one evaluation, so that with about eighty candidates an island spends its
+time in the fitness. Names and method are those of Tanabe and Fukunaga (CEC 2014), with these differences: crossover
+rates are learned by the arithmetic mean of their earlier SHADE (CEC 2013), not by the Lehmer mean, and without a
+terminal rate of zero; the archive holds 1.4 times the population, not 2.6 times; the population does not grow with the
+number of parameters; a trial with the same cost as its parent is discarded.
 """
 
 from __future__ import annotations
@@ -22,26 +22,26 @@ from calibration.observations import Floats
 _MEMORY = 6  # H
 _BEST_SHARE = 0.11  # p
 _ARCHIVE = 1.4  # archive size over population size
-_SPREAD = 0.1  # of the scale factor and of the crossover rate around their memories
-LEAST = 4  # candidates of an island: one and three others
-_LARGEST_GAIN = 1e290  # a gain from an infinite cost, such that sums stay finite
-_ISLAND = 1 << 32  # candidates of island k are numbered from k times this
+_SPREAD = 0.1  # of the scale factor and of the crossover rate about their remembered values
+LEAST = 4  # candidates of an island, as each is combined with three others
+_LARGEST_GAIN = 1e290  # limit for gains from an infinite cost, so that sums stay finite
+_ISLAND = 1 << 32  # the numbers of the candidates of island k start at k times this
 
 
 @dataclass(frozen=True)
 class Settings:
     """Budget of a search.
 
-    The defaults lead into the basin that Gauss-Newton finishes in, for some forty parameters that are up to 400 mm and
-    30 deg off; they end nowhere near the optimum themselves.
+    The defaults suffice to reach a basin from which Gauss-Newton finds the optimum, for about forty parameters that are
+    up to 400 mm and 30 deg off. The search itself does not come close to the optimum.
 
     Attributes:
-        islands: independent populations.
+        islands: number of independent populations.
         population: candidates of each island at the start.
-        least_population: and at the end.
-        evaluations: of each island.
-        epochs: pieces the evaluations are cut into; migration happens between them, and a search can be stopped or
-            interrupted there.
+        least_population: candidates of each island at the end.
+        evaluations: evaluations by each island.
+        epochs: number of parts into which the evaluations are divided. Between two epochs candidates migrate, and a
+            search can be stopped or interrupted.
     """
 
     islands: int = 4
@@ -56,14 +56,14 @@ class Island:
     """State of an island of n candidates between two epochs; its arrays are never changed in place.
 
     Attributes:
-        number: of the island.
-        generation: how many generations it has seen.
-        evaluations: of the fitness.
-        population: (n, p).
-        cost: (n,), never NaN.
+        number: number of the island.
+        generation: number of generations so far.
+        evaluations: number of evaluations of the fitness so far.
+        population: (n, p) candidates.
+        cost: (n,) costs of the candidates, never NaN.
         archive: (k, p) parents that were replaced.
         memory: (2, H) successful scale factors and crossover rates.
-        slot: of the memory that is written next.
+        slot: index of the memory to be written next.
     """
 
     number: int
@@ -85,7 +85,17 @@ def begin(
     settings: Settings,
     number: int,
 ) -> Island:
-    """Draw candidates uniformly from the box, the given ones (k, p) in front."""
+    """Create an island with candidates drawn uniformly from the box.
+
+    Args:
+        fitness: function from (candidates, p) to costs (candidates,).
+        lower: (p,) lower bounds.
+        upper: (p,) upper bounds.
+        start: (k, p) given candidates, which replace the first ones.
+        seed: seed of the search.
+        settings: budget of the search.
+        number: number of the island.
+    """
     population = np.empty((settings.population, len(lower)))
     scatter(word(seed), 0, number * _ISLAND, np.array(lower), np.array(upper), population)
     if start is not None:
@@ -105,7 +115,17 @@ def advance(
     target: int,
     island: Island,
 ) -> Island:
-    """Evolve generations until the island has spent `target` evaluations."""
+    """Evolve generations until the island has spent `target` evaluations.
+
+    Args:
+        fitness: function from (candidates, p) to costs (candidates,).
+        lower: (p,) lower bounds.
+        upper: (p,) upper bounds.
+        seed: seed of the search.
+        settings: budget of the search.
+        target: total evaluations of the island at which to stop.
+        island: state to start from, which is not changed.
+    """
     lower, upper = np.array(lower), np.array(upper)
     population, cost, memory = np.array(island.population), np.array(island.cost), np.array(island.memory)
     archive = np.empty((max(1, int(_ARCHIVE * len(population))), len(lower)))
@@ -154,14 +174,14 @@ def _propose(
     trial: Floats,
     chosen: Floats,
 ) -> None:
-    """Write a trial (n, p) for every candidate and the scale factor and crossover rate (2, n) that made it."""
+    """Write a trial (n, p) for every candidate, and its scale factor and crossover rate `chosen` (2, n)."""
     n, p = population.shape
     order = np.argsort(cost, kind="mergesort")
     best = max(2, round(_BEST_SHARE * n))
     for i in range(n):
         key = stream(seed, generation, first + i)
         index = below(key, 0, memory.shape[1])
-        # Box and Muller's normal; a Cauchy number is the tangent of a uniform angle, drawn again until positive.
+        # A normal number by Box and Muller; a Cauchy number as tangent of a uniform angle, redrawn until positive.
         normal = math.sqrt(-2.0 * math.log(1.0 - uniform(key, 1))) * math.cos(2.0 * math.pi * uniform(key, 2))
         rate = min(1.0, max(0.0, memory[1, index] + _SPREAD * normal))
         draw, factor = 3, 0.0
@@ -211,15 +231,15 @@ def _select(
     generation: int,
     first: int,
 ) -> tuple[int, int, int]:
-    """Keep the better of parent and trial, learn from what succeeded, drop the worst down to `size`.
+    """Keep the better of parent and trial, update the memory from successes, drop the worst down to `size`.
 
     Returns:
-        Candidates, archived parents and the next slot of the memory.
+        Number of candidates, number of archived parents and the next slot of the memory.
     """
     n, p = population.shape
     total = weighted = squared = rates = 0.0
     for i in range(n):
-        if not trial_cost[i] < cost[i]:  # nor where the trial has no cost
+        if not trial_cost[i] < cost[i]:  # also true if the trial's cost is NaN
             continue
         gain = min(cost[i] - trial_cost[i], _LARGEST_GAIN)
         total += gain
@@ -236,7 +256,7 @@ def _select(
             population[i, j] = trial[i, j]
         cost[i] = trial_cost[i]
     if total > 0.0 and weighted > 0.0:
-        memory[0, slot] = squared / weighted  # Lehmer mean, weighted by what was gained
+        memory[0, slot] = squared / weighted  # Lehmer mean, weighted by gain
         memory[1, slot] = rates / total
         slot = (slot + 1) % memory.shape[1]
     while n > size:

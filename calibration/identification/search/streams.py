@@ -1,8 +1,8 @@
-"""Random numbers by counter: every draw is a function of (seed, generation, candidate, number of the draw).
+"""Counter-based random numbers: every draw is a function of (seed, generation, candidate, number of the draw).
 
 SplitMix64 (Steele, Lea and Flood, "Fast splittable pseudorandom number generators", OOPSLA 2014) addressed by its
-counter. No state is carried along, so that a search does not depend on who computes a candidate, nor on whether it
-was interrupted and taken up again.
+counter. There is no state, so the result of a search does not depend on which worker computes a candidate or on
+whether the search was interrupted and resumed.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ _UNIT = 2.0**-53
 
 
 def word(seed: int) -> np.uint64:
-    """Any integer as the 64 bits that streams begin with."""
+    """Return any integer modulo 2^64, as the seed of streams."""
     return np.uint64(seed % 2**64)
 
 
 @compiled
 def mixed(z: np.uint64) -> np.uint64:
-    """SplitMix64's finaliser: a bijection of 64 bits that leaves no pattern of a counter."""
+    """Return SplitMix64's finaliser of `z`: a bijection of 64 bits that removes the pattern of a counter."""
     z = (z ^ (z >> _S30)) * _FIRST
     z = (z ^ (z >> _S27)) * _SECOND
     return z ^ (z >> _S31)
@@ -34,7 +34,7 @@ def mixed(z: np.uint64) -> np.uint64:
 
 @compiled
 def stream(seed: np.uint64, generation: int, candidate: int) -> np.uint64:
-    """Key of the draws of one candidate of one generation."""
+    """Return the key of the draws for one candidate of one generation."""
     key = mixed(np.uint64(seed) + _GAMMA)
     key = mixed(key ^ (np.uint64(generation) + _GAMMA))
     return mixed(key ^ (np.uint64(candidate) + _GAMMA))
@@ -42,19 +42,19 @@ def stream(seed: np.uint64, generation: int, candidate: int) -> np.uint64:
 
 @compiled
 def uniform(key: np.uint64, draw: int) -> float:
-    """Draw number `draw` of a stream, uniform in [0, 1)."""
+    """Return draw number `draw` of a stream, uniform in [0, 1)."""
     return float(mixed(key + np.uint64(draw) * _GAMMA) >> _S11) * _UNIT
 
 
 @compiled
 def below(key: np.uint64, draw: int, n: int) -> int:
-    """Draw number `draw` of a stream, an integer from 0 to n - 1 (bias below n / 2^53)."""
+    """Return draw number `draw` of a stream, an integer from 0 to n - 1 (bias below n / 2^53)."""
     return int(uniform(key, draw) * n)
 
 
 @compiled
 def scatter(seed: np.uint64, generation: int, first: int, lower: Floats, upper: Floats, population: Floats) -> None:
-    """Fill a population (n, p) uniformly from a box; its candidates are numbered from `first`."""
+    """Fill a population (n, p) uniformly from a box; the candidates have the numbers `first` and up."""
     n, p = population.shape
     for i in range(n):
         key = stream(seed, generation, first + i)

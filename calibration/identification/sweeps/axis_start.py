@@ -1,4 +1,4 @@
-"""A start for the refinement from the axes that single-joint sweeps show."""
+"""Start of the refinement from the axes measured by single-joint sweeps."""
 
 from __future__ import annotations
 
@@ -12,33 +12,33 @@ from scipy.optimize import least_squares
 from calibration.identification.linear_model import prior_precision
 from calibration.identification.samples import Samples
 from calibration.identification.start import rigid_fit, rough_start
-from calibration.identification.sweeps.circle_fit import CENTRE, DIRECTION, FEATURES, RADIUS, Curve, fit_curve
+from calibration.identification.sweeps.circle_fit import CENTRE, DIRECTION, FEATURES, RADIUS, SweepCurve, fit_curve
 from calibration.identification.sweeps.circles import Axis, drives_several, joint_values, predicted_curve
 from calibration.kinematics.chain import Chain, ChainData, Placement
 from calibration.observations import Floats
 
-_FAR_PRIOR = 100.0  # build tolerances within which a far start may lie, 1 sigma: angles may be tens of degrees off
+_FAR_PRIOR = 100.0  # prior sigma of a distant start, in build tolerances: angles may be tens of degrees off
 _INNER_ROUNDS, _LAST_ROUNDS = 10, 40
-_FLOOR_RAD, _FLOOR_MM = np.radians(0.2), 5.0  # weights of a start: no axis counts more than it needs to
+_FLOOR_RAD, _FLOOR_MM = np.radians(0.2), 5.0  # added to the axes' sigmas, so that no axis dominates the start
 
 
 def start_from_axes(chain: Chain, samples: Samples, axes: Sequence[Axis]) -> Floats:
-    """Bring the model's axes and circles onto the measured ones, as a start for the refinement.
+    """Fit the model's axes and circles to the measured ones, as a start for the refinement.
 
-    Directions depend on angles alone, and hardly on one another's errors: base and angles are fitted to them first,
-    joints from the base outwards; then lengths to the centres and radii as well. Where a prism is on its circle takes
-    no part, so an angle that turns no measured axis stays at its prior.
+    Directions depend on angles alone, and each hardly on the errors of the others. So base and angles are fitted to the
+    directions first, with joints from the base outwards, and then lengths and angles to centres and radii as well. The
+    position of a prism on its circle is not used, so an angle that turns no measured axis stays at its prior.
 
     Args:
-        chain: kinematics with its bases placed anyhow.
+        chain: kinematics with any placement of the bases.
         samples: the rows, for set-ups without sweeps.
-        axes: of `find_axes`, at least one.
+        axes: result of `find_axes`, at least one.
 
     Returns:
         (p,) parameters.
 
     Raises:
-        UnsafeError: a set-up without sweeps whose fixes cannot place its base.
+        UnsafeError: the fixes of a set-up without sweeps cannot place its base.
     """
     precision = prior_precision(chain, _FAR_PRIOR)
     x = np.zeros(len(chain))
@@ -46,7 +46,7 @@ def start_from_axes(chain: Chain, samples: Samples, axes: Sequence[Axis]) -> Flo
     for setup in seen:
         _turn_base(chain, x, setup, [a for a in axes if a.setup == chain.setups[setup]])
     angles = np.array([p.unit == "rad" and p.kind != "prism" for p in chain.parameters])
-    # The circle of a joint that drives several rows may flip over while their axes are far from where they belong.
+    # The circle of a joint that drives several rows may flip while the axes of these rows are far from correct.
     single = [a for a in axes if not drives_several(chain, a)] or list(axes)
     joints = list(dict.fromkeys(axis.joint for axis in single))
     for count in range(1, len(joints) + 1):
@@ -64,13 +64,13 @@ def start_from_axes(chain: Chain, samples: Samples, axes: Sequence[Axis]) -> Flo
 
 
 def _turn_base(chain: Chain, x: Floats, setup: int, axes: Sequence[Axis]) -> None:
-    """Turn a base so that the model's directions point as the measured ones do."""
+    """Turn a base so that the model's directions match the measured ones."""
     rotation = chain.base(x, setup).rotation
     modelled = np.array([predicted_curve(chain, x, a).features[DIRECTION] for a in axes]) @ rotation
     measured = np.array([a.direction for a in axes])
-    if np.linalg.svd(modelled, compute_uv=False)[1:2].sum() < 0.1:  # parallel axes leave the turn about them open
+    if np.linalg.svd(modelled, compute_uv=False)[1:2].sum() < 0.1:  # parallel axes do not determine the turn about them
         return
-    # Each direction is a point at distance 1 from an origin that stays where it is.
+    # Each direction and its opposite are points at distance 1 from the origin, so the fit is a pure rotation.
     points, targets = np.vstack([modelled, -modelled]), np.vstack([measured, -measured])
     turn = rigid_fit(points, targets, np.ones(len(points))).rotation
     x[chain.base_index(setup)] = chain.base_values(setup, Placement(turn, chain.base(x, setup).translation_mm))
@@ -79,7 +79,7 @@ def _turn_base(chain: Chain, x: Floats, setup: int, axes: Sequence[Axis]) -> Non
 def _fit_axes(
     chain: Chain, x: Floats, axes: Sequence[Axis], free: NDArray[np.bool_], precision: Floats, *, directions_only: bool
 ) -> Floats:
-    """Least squares of the axes' features, and the prior, over the free parameters."""
+    """Fit the free parameters to the axes' features and the prior by least squares."""
     used = np.zeros(FEATURES, dtype=bool)
     used[DIRECTION] = True
     used[CENTRE] = used[RADIUS] = not directions_only
@@ -100,7 +100,7 @@ def _fit_axes(
         out[free] = moved
         return out
 
-    def curves(places: Floats) -> list[Curve]:
+    def curves(places: Floats) -> list[SweepCurve]:
         return [fit_curve(a.kind, places[rows], v) for a, rows, v in zip(axes, own, values, strict=True)]
 
     def residual(moved: Floats) -> Floats:
@@ -130,7 +130,7 @@ def _fit_axes(
 
 
 def _place_others(chain: Chain, samples: Samples, x: Floats, seen: Sequence[int]) -> Floats:
-    """Place the bases of set-ups that have no sweep, now that the body is known."""
+    """Place the bases of set-ups that have no sweep, with the other parameters known."""
     others = [s for s in range(len(chain.setups)) if s not in seen]
     if not others:
         return x
@@ -139,7 +139,7 @@ def _place_others(chain: Chain, samples: Samples, x: Floats, seen: Sequence[int]
     own = samples.select(np.isin(samples.data.setup, others))
     own = replace(own, data=replace(own.data, setup=np.searchsorted(others, own.data.setup)))
     body = np.concatenate([x[: chain.base_start], np.zeros(6 * len(others))])
-    # Only a start: whether coordinates are mirrored is judged by the fit.
+    # This is only a start; the fit checks whether coordinates are mirrored.
     start = rough_start(blank, own, body, offsets=False, mirrored="let pass")
     out = x.copy()
     for setup in others:

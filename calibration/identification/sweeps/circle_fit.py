@@ -1,8 +1,8 @@
-"""Circles and lines through the places of a prism while one joint moves, with their sensitivity to each place.
+"""Circles and lines through the positions of a prism while one joint moves, with derivatives by each position.
 
-Least squares of the geometric distance (a circle: out of its plane and off its radius), by Levenberg-Marquardt from
-the algebraic fit. Gross outliers go first: the circle or line of the three or two places that leaves the smallest
-median distance decides which places count (Rousseeuw's least median of squares).
+Least squares of the geometric distance (for a circle: out of its plane and off its radius), by Levenberg-Marquardt from
+the algebraic fit. Gross outliers are removed first: the circle through three positions, or line through two, with the
+smallest median distance decides which positions count (Rousseeuw's least median of squares).
 """
 
 from __future__ import annotations
@@ -22,23 +22,24 @@ DIRECTION, CENTRE, RADIUS, TRAVEL = slice(0, 3), slice(3, 6), 6, 7
 FEATURES = 8
 
 _ROUNDS = 50
-_GAIN = 1e-10
-_EXACT = 1e-9  # of the radius: places of a model that turns about one axis
-_TRIED = 40
-_TRIALS = 300
+_GAIN = 1e-10  # relative decrease of the squares at which the iteration ends
+_EXACT = 1e-9  # of the radius; positions of a model that turns about one axis fit as exactly
+_TRIED = 40  # positions
+_TRIALS = 300  # circles or lines
 _OUTLYING = 4.5  # standard deviations
-_GROWTH = 10
+_GROWTH = 10  # rounds
 
 
 @dataclass(frozen=True)
-class Curve:
+class SweepCurve:
     """A circle or a line.
 
     Attributes:
-        features: (8,) direction, about which it turns right-handed or along which it travels as readings grow; centre,
-            mm, of a line its middle; radius, mm, 0 for a line; travel, rad or mm per unit of reading.
-        sensitivity: (8, n, 3) derivative of the features by the places.
-        distance_mm: (n,) of the places from the curve.
+        features: (8,) direction, centre, radius and travel. The direction is that of right-handed rotation, or of
+            motion along a line, as readings increase. The centre, mm, is the middle of a line. The radius, mm, is 0 for
+            a line. The travel is in rad or mm per unit of reading.
+        sensitivity: (8, n, 3) derivative of the features by the positions.
+        distance_mm: (n,) distance of the positions from the curve.
     """
 
     features: Floats
@@ -47,17 +48,17 @@ class Curve:
 
     @property
     def freedom(self) -> int:
-        """Degrees of freedom that the places leave: two of each are off the curve."""
+        """Degrees of freedom of the residuals: two for each position, minus the parameters of the curve."""
         return 2 * len(self.distance_mm) - (6 if self.features[RADIUS] else 4)
 
 
-def fit_curve(kind: Kind, places_mm: Floats, readings: Floats) -> Curve:
-    """Fit the circle or line of least squared distance.
+def fit_curve(kind: Kind, places_mm: Floats, readings: Floats) -> SweepCurve:
+    """Fit the circle or line with the least sum of squared distances.
 
     Args:
         kind: `revolute` for a circle, `prismatic` for a line.
-        places_mm: (n, 3), at least 3, not all the same.
-        readings: (n,) of the joint, not all the same; they give the curve its sense and its travel.
+        places_mm: (n, 3) positions, at least 3, not all the same.
+        readings: (n,) readings of the joint, not all the same; they determine the sense of direction and the travel.
     """
     if kind == "revolute":
         return _curve_of_circle(_least_squares_circle(places_mm), places_mm, readings)
@@ -65,7 +66,13 @@ def fit_curve(kind: Kind, places_mm: Floats, readings: Floats) -> Curve:
 
 
 def without_outliers(kind: Kind, places_mm: Floats, sigma_mm: float) -> NDArray[np.bool_]:
-    """(n,) True for places that lie on one circle or line within a few `sigma_mm` or of their own scatter."""
+    """Return an (n,) mask of positions on one circle or line.
+
+    Args:
+        kind: `revolute` for a circle, `prismatic` for a line.
+        places_mm: (n, 3) positions.
+        sigma_mm: noise of a position; the scatter about the curve is used instead if it is larger.
+    """
     n, taken = len(places_mm), 3 if kind == "revolute" else 2
     some = np.linspace(0, n - 1, min(n, _TRIED)).astype(int).tolist()
     every = np.array(list(itertools.combinations(some, taken)))
@@ -87,7 +94,7 @@ def without_outliers(kind: Kind, places_mm: Floats, sigma_mm: float) -> NDArray[
 
 
 def _off_circle(places: Floats, kept: NDArray[np.bool_]) -> tuple[Floats, float]:
-    """(n,) distances from the circle through the kept places, each for how uncertain the circle is there; scatter."""
+    """Return (n,) distances from the circle of the kept positions, scaled for its uncertainty there; and scatter."""
     through = _least_squares_circle(places[kept])
     jacobian = through.jacobian()
     covariance = np.linalg.pinv(jacobian.T @ jacobian)
@@ -100,7 +107,7 @@ def _off_circle(places: Floats, kept: NDArray[np.bool_]) -> tuple[Floats, float]
 
 
 def _off_line(places: Floats, kept: NDArray[np.bool_]) -> tuple[Floats, float]:
-    """As `_off_circle`, for a line."""
+    """Return distances and scatter as `_off_circle`, for a line."""
     middle = places[kept].mean(axis=0)
     direction = np.linalg.svd(places[kept] - middle, full_matrices=False)[2][0]
     along = (places - middle) @ direction
@@ -111,11 +118,11 @@ def _off_line(places: Floats, kept: NDArray[np.bool_]) -> tuple[Floats, float]:
 
 
 def _from_circles(places: Floats, corners: Floats) -> Floats:
-    """(trials, n) distance of places (n, 3) from the circles through corners (trials, 3, 3)."""
+    """Return (trials, n) distances of positions (n, 3) from the circles through corners (trials, 3, 3)."""
     a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     normal = np.cross(a, b)
     square = (normal**2).sum(axis=1, keepdims=True)
-    with np.errstate(divide="ignore", invalid="ignore"):  # corners on a line make no circle: NaN is never the best
+    with np.errstate(divide="ignore", invalid="ignore"):  # corners on a line give NaN, which is never the best
         to_centre = (
             np.cross(normal, a) * (b**2).sum(axis=1, keepdims=True)
             + np.cross(b, normal) * (a**2).sum(axis=1, keepdims=True)
@@ -129,7 +136,7 @@ def _from_circles(places: Floats, corners: Floats) -> Floats:
 
 
 def _from_lines(places: Floats, corners: Floats) -> Floats:
-    """(trials, n) distance of places (n, 3) from the lines through corners (trials, 2, 3)."""
+    """Return (trials, n) distances of positions (n, 3) from the lines through corners (trials, 2, 3)."""
     along = corners[:, 1] - corners[:, 0]
     with np.errstate(divide="ignore", invalid="ignore"):
         along = along / np.linalg.norm(along, axis=1, keepdims=True)
@@ -143,7 +150,7 @@ def _from_lines(places: Floats, corners: Floats) -> Floats:
 
 @dataclass(frozen=True)
 class _Round:
-    """A circle with its residuals: the places' heights over its plane, and their distances from its radius."""
+    """A circle with its residuals: heights of the positions over its plane, and their excess over its radius."""
 
     u: Floats
     v: Floats
@@ -169,7 +176,7 @@ class _Round:
         return float(self.height @ self.height + self.excess @ self.excess)
 
     def jacobian(self) -> Floats:
-        """(2 n, 6) of heights and excesses by tilts towards u and v, centre and radius."""
+        """Return (2 n, 6) derivatives of heights and excesses by tilts towards u and v, centre and radius."""
         n = len(self.height)
         out = np.zeros((2 * n, 6))
         arm = self.height[:, None] * self.normal + (self.excess + self.radius)[:, None] * self.outward
@@ -227,7 +234,7 @@ def _algebraic_circle(places: Floats) -> _Round:
     return _Round.of(places, normal, middle + unit * (a * u + b * v), float(radius))
 
 
-def _curve_of_circle(found: _Round, places: Floats, readings: Floats) -> Curve:
+def _curve_of_circle(found: _Round, places: Floats, readings: Floats) -> SweepCurve:
     n = len(places)
     order = np.argsort(readings, kind="stable")
     phase = np.empty(n)
@@ -235,7 +242,7 @@ def _curve_of_circle(found: _Round, places: Floats, readings: Floats) -> Curve:
     centred = readings - readings.mean()
     travel = float(centred @ phase) / float(centred @ centred)
     sense = -1.0 if travel < 0.0 else 1.0
-    # A place moves its height by the normal and its excess by the outward unit vector; both move the six unknowns.
+    # A position affects its height along the normal and its excess along the outward vector; both affect the unknowns.
     inverse = np.linalg.pinv(found.jacobian())[:, :, None]
     unknowns = -(inverse[:, :n] * found.normal + inverse[:, n:] * found.outward)  # (6, n, 3)
     sensitivity = np.zeros((FEATURES, n, 3))
@@ -246,13 +253,13 @@ def _curve_of_circle(found: _Round, places: Floats, readings: Floats) -> Curve:
     share = sense * centred / float(centred @ centred) / np.maximum(found.radius + found.excess, 1e-9)
     sensitivity[TRAVEL] = share[:, None] * tangent - np.tensordot(share @ tangent, unknowns[2:5], axes=1)
     features = np.concatenate([sense * found.normal, found.centre, [found.radius, abs(travel)]])
-    return Curve(features, sensitivity, np.hypot(found.height, found.excess))
+    return SweepCurve(features, sensitivity, np.hypot(found.height, found.excess))
 
 
 # -- line ------------------------------------------------------------------------------------------------------------
 
 
-def _line(places: Floats, readings: Floats) -> Curve:
+def _line(places: Floats, readings: Floats) -> SweepCurve:
     n = len(places)
     middle = places.mean(axis=0)
     arm = places - middle
@@ -268,11 +275,11 @@ def _line(places: Floats, readings: Floats) -> Curve:
     sensitivity[CENTRE] = np.broadcast_to(np.eye(3)[:, None, :] / n, (3, n, 3))
     sensitivity[TRAVEL] = sense * (centred / float(centred @ centred))[:, None] * direction
     features = np.concatenate([sense * direction, middle, [0.0, abs(travel)]])
-    return Curve(features, sensitivity, np.linalg.norm(off, axis=1))
+    return SweepCurve(features, sensitivity, np.linalg.norm(off, axis=1))
 
 
 def _across(direction: Floats) -> Floats:
-    """A unit vector across a direction."""
+    """Return a unit vector perpendicular to a direction."""
     axis = np.zeros(3)
     axis[int(np.abs(direction).argmin())] = 1.0
     out = axis - (axis @ direction) * direction

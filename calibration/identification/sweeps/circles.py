@@ -1,8 +1,8 @@
-"""Axes from circles: while one joint moves and the others stand, its prism runs on a circle about the joint's axis.
+"""Axes from circles: while one joint moves and the others stand still, a prism moves on a circle about its axis.
 
-The first paper's section 3.1. A prismatic joint's line is treated likewise. Where a joint drives several rows (a
-parallel linkage) the prism still runs on a curve, and the circle that fits it best is a summary of it; such circles are
-never taken for an axis of the machine, only held against the circle that fits the model's own places of that sweep.
+The method of section 3.1 of the first paper. The line of a prismatic joint is treated in the same way. Where a joint
+drives several rows (a parallel linkage), the prism still moves on a curve, which the best-fitting circle summarises.
+Such a circle is not an axis of the machine, and is only compared with the circle of the model's predicted positions.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from calibration.identification.sweeps.circle_fit import (
     CENTRE,
     DIRECTION,
     TRAVEL,
-    Curve,
     Kind,
+    SweepCurve,
     fit_curve,
     without_outliers,
 )
@@ -29,26 +29,26 @@ from calibration.observations import Floats
 from calibration.rig.description import Joint
 
 _MOST_SWEEPS = 10  # of one joint, prism and set-up
-_REACH = 0.75  # of the spread, about a row in the middle of its group
+_REACH = 0.75  # of a standing joint's spread: greatest distance from the central row of a group
 _LEAST_TURN = np.radians(10.0)
 _LEAST_STROKE_MM = 50.0
-_WIDEST_STEP = np.radians(150.0)  # beyond it the sense of turning is a guess
-_MOST_TILT = np.radians(5.0)  # standard error of a direction that is worth having
-_CLEAN = 4.0  # a sweep's mean square over the median sweep's
+_WIDEST_STEP = np.radians(150.0)  # beyond it the sense of rotation is ambiguous
+_MOST_TILT = np.radians(5.0)  # greatest standard error of a useful direction
+_CLEAN = 4.0  # greatest mean square of a clean sweep, relative to the median sweep's
 
 
 @dataclass(frozen=True)
 class Axis:
-    """A joint's axis as one sweep of one prism shows it, in the station's frame.
+    """A joint's axis as measured by one sweep of one prism, in the station's frame.
 
     Attributes:
-        joint, setup, prism: whose sweep it is.
+        joint, setup, prism: names of the sweep's joint, set-up and prism.
         kind: `revolute` for a circle, `prismatic` for a line.
-        features: (8,) direction, centre in mm, radius in mm, travel (`circle_fit.Curve`): direction by the right-hand
-            rule, or the way of travel, as readings grow.
-        covariance: (8, 8) of the features.
-        freedom: degrees of freedom behind the covariance.
-        sweep: (n) readings of the places that count, those of the standing joints at their medians.
+        features: (8,) direction, centre in mm, radius in mm, travel (`circle_fit.SweepCurve`). The direction is that of
+            right-handed rotation, or of motion along a line, as readings increase.
+        covariance: (8, 8) covariance of the features.
+        freedom: degrees of freedom of the covariance.
+        sweep: (n) readings at the positions that count, with those of the standing joints at their medians.
     """
 
     joint: str
@@ -67,7 +67,7 @@ class Axis:
 
     @property
     def direction_sigma_rad(self) -> float:
-        """Standard error of the direction, its worst way."""
+        """Standard error of the direction where it is largest."""
         return float(np.sqrt(np.linalg.eigvalsh(self.covariance[DIRECTION, DIRECTION])[-1]))
 
     @property
@@ -77,7 +77,7 @@ class Axis:
 
     @property
     def travel(self) -> float:
-        """Motion along the curve for each rad or mm that the reading grows; 1 for a sound encoder."""
+        """Motion along the curve for each rad or mm of the reading; 1 for a correct encoder."""
         return float(self.features[TRAVEL])
 
 
@@ -86,16 +86,16 @@ class _Measured:
     joint: int
     kind: Kind
     sweep: ChainData
-    curve: Curve
+    curve: SweepCurve
     variance: Floats  # (n,) mm^2 per axis that the station explains
 
 
 def find_axes(chain: Chain, samples: Samples) -> tuple[Axis, ...]:
-    """Find the axes that single-joint sweeps show, from the base outwards.
+    """Find the axes measured by single-joint sweeps, from the base outwards.
 
     A sweep is at least five different positions of one joint, seen by one prism at one set-up, while all joints that
-    could move that prism stand still within their reading noise. What moves, turns or only shifts the prism is taken
-    from the chain's structure; its numbers play no part.
+    could move that prism stand still within their reading noise. Which joints move the prism, and whether they turn or
+    only shift it, follows from the structure of the chain; its parameter values are not used.
 
     Args:
         chain: kinematics.
@@ -104,7 +104,7 @@ def find_axes(chain: Chain, samples: Samples) -> tuple[Axis, ...]:
     found = [m for sweep in _sweeps(chain, samples) if (m := _measured(chain, samples, *sweep)) is not None]
     if not found:
         return ()
-    # One scale of the noise for all sweeps that are clean curves; any other has its own.
+    # All clean sweeps share one scale of the noise; every other sweep has its own.
     own = np.array([_squares(m) / m.curve.freedom for m in found])
     clean = [m for m, scale in zip(found, own, strict=True) if scale <= _CLEAN * np.median(own)]
     freedom = sum(m.curve.freedom for m in clean)
@@ -115,14 +115,14 @@ def find_axes(chain: Chain, samples: Samples) -> tuple[Axis, ...]:
     return tuple(sorted(kept, key=lambda a: (first[a.joint], chain.rig.joint_names.index(a.joint))))
 
 
-def predicted_curve(chain: Chain, x: Floats, axis: Axis) -> Curve:
-    """Curve of the same sweep by the kinematics at `x` (p,)."""
+def predicted_curve(chain: Chain, x: Floats, axis: Axis) -> SweepCurve:
+    """Return the curve of the same sweep that the kinematics predict at `x` (p,)."""
     places = chain.positions_mm(x, axis.sweep)
     return fit_curve(axis.kind, places, joint_values(chain, axis.joint, axis.sweep))
 
 
 def drives_several(chain: Chain, axis: Axis) -> bool:
-    """True if the joint moves the prism in several places at once, so that its circle is about no axis of the rig."""
+    """Return True if the joint drives several rows before the prism, so that its circle is about no axis of the rig."""
     prism, joint = chain.rig.prism_names.index(axis.prism), chain.rig.joint_names.index(axis.joint)
     return sum(driven == joint for op in chain.prism_chain(prism) for driven, _ in op.drive) > 1
 
@@ -131,7 +131,7 @@ def drives_several(chain: Chain, axis: Axis) -> bool:
 
 
 def _sweeps(chain: Chain, samples: Samples) -> Iterator[tuple[int, Kind, Integers]]:
-    """Every joint and kind of curve with the rows of one of its sweeps."""
+    """Yield the joint, kind of curve and rows of every sweep."""
     spread = standing_spread(chain.rig)
     data = samples.data
     for setup, prism in np.unique(np.column_stack([data.setup, data.prism]), axis=0).tolist():
@@ -146,7 +146,7 @@ def _sweeps(chain: Chain, samples: Samples) -> Iterator[tuple[int, Kind, Integer
 
 
 def _standing(values: Floats) -> Iterator[Integers]:
-    """Largest few groups of rows (n, k) that agree in every column, at least five in each; 1 is their spread."""
+    """Yield the largest groups of five or more rows that agree in every column of `values` (n, k), in spreads."""
     if values.shape[1] == 0:
         yield np.arange(len(values))
         return
@@ -171,7 +171,7 @@ def _measured(chain: Chain, samples: Samples, joint: int, kind: Kind, rows: Inte
     variance = np.trace(samples.station_covariance[rows], axis1=1, axis2=2) / 3.0
     order = np.argsort(samples.data.readings[rows, joint], kind="stable")
     rows, variance = rows[order], variance[order]
-    # The pose in which the joint stands while others are swept comes again and again: one place, not most of them.
+    # The pose of the joint while others are swept occurs many times, but must count as one position only.
     stop = stops(samples.data.readings[rows, joint], float(spread))
     readings, variance = _medians(samples.data.readings[rows, joint], stop), _medians(variance, stop)
     if not _enough(rig.joint(name), readings):
@@ -189,12 +189,12 @@ def _measured(chain: Chain, samples: Samples, joint: int, kind: Kind, rows: Inte
 
 
 def _medians(values: Floats, stop: Integers) -> Floats:
-    """Medians of the rows (n, ...) of each stop."""
+    """Return medians of the rows (n, ...) of each stop."""
     return np.array([np.median(values[stop == i], axis=0) for i in range(int(stop[-1]) + 1)])
 
 
 def _enough(joint: Joint, readings: Floats) -> bool:
-    """True if rising readings have enough places, reach and no step so wide that the way round is a guess."""
+    """Return True if ascending readings are many and far enough, without a step of ambiguous sense of rotation."""
     if len(readings) < LEAST_STOPS:
         return False
     steps = np.diff(readings)
@@ -204,7 +204,7 @@ def _enough(joint: Joint, readings: Floats) -> bool:
 
 
 def joint_values(chain: Chain, joint: str, sweep: ChainData) -> Floats:
-    """(n,) readings of a joint in a sweep, rad or mm."""
+    """Return the (n,) readings of a joint in a sweep, rad or mm."""
     readings = sweep.readings[:, chain.rig.joint_names.index(joint)]
     return np.radians(readings) if chain.rig.joint(joint).kind == "revolute" else readings
 

@@ -1,9 +1,9 @@
-"""Search for the curves that explain a residual, by their evidence.
+"""Search for the curves that explain a residual, by marginal likelihood (evidence).
 
-Terms are taken one after another, each the one that raises the marginal likelihood most (Tipping and Faul 2003, Fast
-marginal likelihood maximisation for sparse Bayesian models; here with a whole curve in place of one basis function),
-as long as it raises it by more than the number of candidates makes likely by chance. Amplitude and length of every
-curve, the size of the parameters' corrections and the noise maximise the marginal likelihood of all together.
+Terms are added one after another. Each is the one that raises the marginal likelihood most (Tipping and Faul 2003, Fast
+marginal likelihood maximisation for sparse Bayesian models; here with a whole curve in place of one basis function).
+The search ends when no term raises it by more than the number of candidates makes likely by chance. Amplitude and
+length of every curve, the size of the parameters' corrections and the noise jointly maximise the marginal likelihood.
 """
 
 from __future__ import annotations
@@ -17,49 +17,49 @@ from scipy.linalg import cho_solve, lapack, solve_triangular
 from scipy.optimize import minimize
 
 from calibration.observations import Floats
-from calibration.residual.gaussian.curves import Axis, Curve, log_amplitudes, products, slope_by_log_length, waves
+from calibration.residual.gaussian.curves import Curve, Variable, log_amplitudes, products, slope_by_log_length, waves
 
 _WAVES, _PAIR_WAVES = 8, 4
-# A joint's error along its own value: encoders and gears err many times a turn.
+# For a joint's error over its own value: errors of encoders and gears have many periods per turn.
 _FINE_WAVES, _FINE_TURN_WAVES = 40, 120
 _FINE_DISTINCT = 30
 _MOST_TERMS = 40
 _PER_ROUND = 6  # terms between two optimisations
-_CONSIDERED = 8  # best by a quick estimate, to be weighed exactly
-_WORTH_A_LOOK = 2.0  # nats, by the quick estimate
-_SURE = 5.0  # nats beyond the logarithm of the number of candidates
-_AMPLITUDES = (0.1, 0.3, 1.0)  # of a curve, over what is left to explain
-_LENGTHS, _FINE_LENGTHS = (0.1, 0.5), (0.02, 0.15)  # over a radian of the scaled variable
+_CONSIDERED = 8  # best by a quick estimate, whose gain is computed exactly
+_WORTH_A_LOOK = 2.0  # nats of gain, by the quick estimate
+_SURE = 5.0  # nats of gain in addition to the logarithm of the number of candidates
+_AMPLITUDES = (0.1, 0.3, 1.0)  # of a curve, relative to the spread that is not explained yet
+_LENGTHS, _FINE_LENGTHS = (0.1, 0.5), (0.02, 0.15)  # relative to a radian of the scaled variable
 _AMPLITUDE_STEPS, _LENGTH_STEPS = (0.1, 0.3, 1.0, 3.0), (0.3, 1.0, 3.0)  # about the quick estimate's best
 _USUAL_LOG_LENGTH, _LOG_LENGTH_SPREAD = math.log(0.3), 1.5
 _LENGTH_LIMITS = (math.log(0.005), math.log(5.0))
-_FREEDOM, _WIDEST = 7.0, 3.0  # logarithms of amplitudes and noise below and above the residual's spread
+_FREEDOM, _WIDEST = 7.0, 3.0  # range of log amplitudes and log noise below and above the log spread of the residual
 _ITERATIONS, _LAST_ITERATIONS = 10, 40
-_ENOUGH = 0.01  # nats, by which a step must raise the evidence for another one
+_ENOUGH = 0.01  # nats; a step that raises the evidence by less is the last
 _LEAST = 1e-12
 _ROUNDING = 1e-12
 
 
 class Rows:
-    """Rows as a linear model sees them.
+    """Rows with the design matrices of a linear model.
 
     Attributes:
         axes: variables.
-        scaled: (n, axes) their scaled values.
-        levers: (n, 3, l) joints, then the base frame's axes, mm per deg or mm.
-        parameters: (n, 3, p) parameters of the kinematics, each with an RMS of 1, or 0.
-        target_mm: (n, 3).
+        scaled: (n, axes) scaled values of the variables.
+        levers: (n, 3, l) derivatives by the joints, then by the base frame's axes, mm per deg or mm.
+        parameters: (n, 3, p) derivatives by the parameters of the kinematics, each scaled to an RMS of 1, or 0.
+        target_mm: (n, 3) residuals.
     """
 
     def __init__(
-        self, axes: Sequence[Axis], scaled: Floats, levers: Floats, parameters: Floats, target_mm: Floats
+        self, axes: Sequence[Variable], scaled: Floats, levers: Floats, parameters: Floats, target_mm: Floats
     ) -> None:
         self.axes, self.scaled, self.levers, self.parameters = axes, scaled, levers, parameters
         self.target_mm = target_mm
         self._waves: dict[tuple[tuple[int, ...], tuple[int, ...]], tuple[Floats, Floats]] = {}
 
     def waves(self, axes: tuple[int, ...], counts: tuple[int, ...]) -> tuple[Floats, Floats]:
-        """(n, m) functions and (m,) squared frequencies."""
+        """Return the (n, m) eigenfunctions over one or two variables and their (m,) squared frequencies."""
         found = self._waves.get((axes, counts))
         if found is None:
             values, frequency = waves(self.axes[axes[0]], self.scaled[:, axes[0]], counts[0])
@@ -71,12 +71,12 @@ class Rows:
         return found
 
     def columns(self, curve: Curve) -> Floats:
-        """(3 n, m) displacements by unit weights of a curve."""
+        """Return the (3 n, m) displacements by unit weights of a curve."""
         values, _ = self.waves(curve.axes, curve.counts)
         return np.asarray((self.levers[:, :, curve.lever, None] * values[:, None, :]).reshape(3 * len(values), -1))
 
     def matrix(self, curves: Sequence[Curve]) -> Floats:
-        """(3 n, p + m) parameters, then curves."""
+        """Return the (3 n, p + m) design matrix: parameters, then curves."""
         parameters = self.parameters.reshape(3 * len(self.scaled), -1)
         return np.hstack([parameters, *(self.columns(curve) for curve in curves)])
 
@@ -93,7 +93,7 @@ class _Candidates:
 
 @dataclass(frozen=True)
 class _Guess:
-    """A candidate with the amplitude and length that suit it, and its gain in log evidence."""
+    """A candidate with its best amplitude and length, and its gain in log evidence."""
 
     gain: float
     curve: Curve
@@ -103,7 +103,7 @@ class _Guess:
 
 @dataclass(frozen=True)
 class Terms:
-    """Curves with their logarithms of amplitude and length, and those of noise and size of the corrections."""
+    """Curves with the logarithms of their amplitudes and lengths, of the noise and of the size of the corrections."""
 
     curves: tuple[Curve, ...]
     log_amplitude: tuple[float, ...]
@@ -113,15 +113,15 @@ class Terms:
 
 
 class CurveSearch:
-    """Curves for the residual of some rows.
+    """Search for curves that explain the residual of some rows.
 
     Args:
-        rows: what is to be explained.
-        own: joint -> axis of its own value.
-        start: terms of similar rows; those that these rows do not ask for end with no amplitude to speak of.
+        rows: the rows.
+        own: axis of its own value, by joint.
+        start: terms found for similar rows. The amplitudes of those without evidence in these rows become negligible.
 
     Attributes:
-        curves: found so far.
+        curves: curves found so far.
     """
 
     def __init__(self, rows: Rows, own: Mapping[int, int], start: Terms | None = None) -> None:
@@ -136,7 +136,7 @@ class CurveSearch:
         self._p = self._matrix.shape[1]
         self._gram, self._moment = self._matrix.T @ self._matrix, self._matrix.T @ self._y
         self._square_frequency: list[Floats] = []
-        # Logarithms: what there is to explain, size of the parameters' corrections, noise, amplitudes, lengths.
+        # Logarithms of the target's spread, the size of the parameters' corrections, noise, amplitudes and lengths.
         self._log_spread = math.log(max(float(self._y.std()), _LEAST))
         self._log_correction, self._log_sigma = self._log_spread - 1.0, self._log_spread
         self._log_amplitude: list[float] = []
@@ -148,7 +148,7 @@ class CurveSearch:
             self._log_correction, self._log_sigma = start.log_correction, start.log_sigma
 
     def run(self) -> None:
-        """Take terms until none is likely."""
+        """Add terms until no candidate has significant evidence."""
         if self.curves:
             self._optimise(_LAST_ITERATIONS)
         begun = len(self.curves)
@@ -164,10 +164,10 @@ class CurveSearch:
         return Terms(tuple(self.curves), amplitude, length, self._log_correction, self._log_sigma)
 
     def weights(self, gram: Floats, moment: Floats) -> Floats:
-        """(p + m,) corrections of the parameters, then the curves' weights, for other rows.
+        """Return (p + m,) corrections of the parameters, then weights of the curves, for other rows.
 
         Args:
-            gram: (p + m, p + m) M'M of `Rows.matrix`.
+            gram: (p + m, p + m) M'M with M of `Rows.matrix`.
             moment: (p + m,) M'y.
         """
         sd, variance = self._prior(self._theta), math.exp(2.0 * self._log_sigma)
@@ -191,7 +191,7 @@ class CurveSearch:
         return found
 
     def _count(self, axis: int, most: int) -> int:
-        """Number of waves of a variable with so few different values; even where it goes round."""
+        """Return the number of waves of a variable: no more than its distinct values, and even if it is periodic."""
         count = min(most, self._distinct[axis]) if self._distinct[axis] > 1 else 0
         return count - count % 2 if self._rows.axes[axis].is_periodic else count
 
@@ -209,7 +209,7 @@ class CurveSearch:
     # ---- one round ---------------------------------------------------------------------------------------------------
 
     def _take_some(self) -> int:
-        """Take up to `_PER_ROUND` terms with the others as they are; return how many were taken."""
+        """Add up to `_PER_ROUND` terms, with the hyperparameters of the others fixed; return the number added."""
         taken = 0
         while taken < _PER_ROUND and len(self.curves) < _MOST_TERMS:
             sd, variance = self._prior(self._theta), math.exp(2.0 * self._log_sigma)
@@ -226,7 +226,7 @@ class CurveSearch:
         return taken
 
     def _quick_guesses(self, left: Floats, variance: float) -> list[_Guess]:
-        """Estimate each candidate's gain as if its waves were independent of each other and of the terms so far."""
+        """Estimate each candidate's gain, assuming its waves are independent of each other and of the terms so far."""
         by_lever = np.einsum("nk,nkl->nl", left.reshape(-1, 3), self._rows.levers)
         spread = float(left.std())
         found = []
@@ -257,14 +257,14 @@ class CurveSearch:
         return found
 
     def _squares(self, candidates: _Candidates) -> Floats:
-        """(m, l) summed squares of each wave at each lever, which stay the same from term to term."""
+        """Return (m, l) sums of squares of each wave at each lever; these do not depend on the terms so far."""
         if candidates not in self._information:
             values, _ = self._rows.waves(candidates.axes, candidates.counts)
             self._information[candidates] = (values**2).T @ self._lever_square
         return self._information[candidates]
 
     def _weigh(self, guess: _Guess, left: Floats, sd: Floats, factor: Floats, variance: float) -> _Guess:
-        """Compute the gain in log evidence beside the terms so far, at the best amplitude and length near the guess."""
+        """Compute the gain in log evidence, given the terms so far, at the best amplitude and length near the guess."""
         columns = self._rows.columns(guess.curve)
         _, square = self._rows.waves(guess.curve.axes, guess.curve.counts)
         shared = solve_triangular(factor, sd[:, None] * (self._matrix.T @ columns), lower=True) / variance
@@ -307,7 +307,7 @@ class CurveSearch:
         return np.array([self._log_correction, *self._log_amplitude, *self._log_length])
 
     def _prior(self, theta: Floats) -> Floats:
-        """(p + m,) standard deviations of parameters' corrections and weights."""
+        """Return (p + m,) prior standard deviations of the parameters' corrections and of the weights."""
         terms = len(self.curves)
         amplitude, length = theta[1 : 1 + terms], theta[1 + terms : 1 + 2 * terms]
         parts = [
@@ -317,7 +317,7 @@ class CurveSearch:
         return np.concatenate([np.full(self._p, math.exp(theta[0])), *parts])
 
     def _optimise(self, iterations: int) -> None:
-        """Maximise the marginal likelihood of amplitudes, lengths, noise and the size of the corrections."""
+        """Maximise the marginal likelihood over amplitudes, lengths, noise and the size of the corrections."""
         terms = len(self.curves)
         start = np.append(self._theta, self._log_sigma)
         total, rows = float(self._y @ self._y), len(self._y)
@@ -353,7 +353,7 @@ class CurveSearch:
             (self._log_spread - _FREEDOM, self._log_spread + _WIDEST),
         ]
         start = np.clip(start, *np.transpose(bounds))
-        # SciPy's tolerance is relative to a value of many thousands.
+        # SciPy's tolerance is relative to the cost, which is many thousands.
         enough = _ENOUGH / max(abs(cost(start)[0]), 1.0)
         found = minimize(
             cost, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": iterations, "ftol": enough}
@@ -364,16 +364,16 @@ class CurveSearch:
 
 
 def _factor(gram: Floats, sd: Floats, variance: float) -> Floats:
-    """Lower Cholesky factor of 1 + S M'M S / variance."""
+    """Return the lower Cholesky factor of 1 + S M'M S / variance, where S is the diagonal matrix of `sd`."""
     inside = np.multiply(gram, sd[:, None], order="F")
     inside *= sd / variance
     inside[np.diag_indices_from(inside)] += 1.0 + _ROUNDING * float(np.diag(inside).max(initial=0.0))
     factor, failed = lapack.dpotrf(inside, lower=1, overwrite_a=1)
     if failed:
-        raise np.linalg.LinAlgError("the products of curves are not those of any columns")
+        raise np.linalg.LinAlgError("the normal matrix of the curves is not positive definite")
     return np.asarray(factor, dtype=np.float64)
 
 
 def _solve(factor: Floats, right: Floats) -> Floats:
-    """Solution by a lower Cholesky factor."""
+    """Solve a linear system with the lower Cholesky factor of its matrix."""
     return np.asarray(cho_solve((factor, True), right, check_finite=False))

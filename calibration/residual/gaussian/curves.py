@@ -1,8 +1,8 @@
-"""Curves over one variable or two, as sums of sines: a Gaussian process on an interval.
+"""Curves over one or two variables as sums of sines: a Gaussian process on an interval.
 
 A stationary Gaussian process on [-L, L] is a sum of the Laplacian's eigenfunctions with independent weights, whose
 variances are the spectral density at their frequencies (Solin and Särkkä 2020, Hilbert space methods for reduced-rank
-Gaussian process regression). On a whole turn the eigenfunctions are sines and cosines of the angle.
+Gaussian process regression). For a periodic variable the eigenfunctions are sines and cosines of the angle.
 """
 
 from __future__ import annotations
@@ -19,19 +19,19 @@ from calibration.observations import Floats
 
 Integers = NDArray[np.intp]
 
-PADDING = 1.2  # half of the interval over half of the variable's range
-_ROUGHNESS = 1.5  # of the square root of a Matern 5/2 spectral density
+PADDING = 1.2  # width of the interval, relative to the variable's range
+_ROUGHNESS = 1.5  # exponent of the square root of a Matern 5/2 spectral density
 _LEAST_RANGE = 1e-9
 _MOST_WAVES = 256
 
 
 @dataclass(frozen=True)
-class Axis:
+class Variable:
     """A variable of curves.
 
     Attributes:
-        low, high: its range in training; values beyond it are taken for the nearest end.
-        is_periodic: an angle, deg, that goes all the way round.
+        low, high: its range in training; values beyond it are replaced by the nearest end.
+        is_periodic: whether it is an angle, deg, that covers whole turns.
     """
 
     low: float
@@ -39,25 +39,25 @@ class Axis:
     is_periodic: bool
 
     def check(self) -> None:
-        """ValueError unless its range is one."""
+        """Raise ValueError unless the range is finite and in order."""
         if not (math.isfinite(self.low) and math.isfinite(self.high) and self.low <= self.high):
-            raise ValueError("a variable of the Gaussian process has no range")
+            raise ValueError("a variable of the Gaussian process has no valid range")
 
     def scaled(self, value: Floats) -> Floats:
-        """(n,) to [-1, 1], or to half turns; NaN stays."""
+        """Scale values (n,) to [-1, 1], or to half turns if periodic; NaN stays NaN."""
         if self.is_periodic:
             return np.asarray(value / 180.0)
         middle, half = 0.5 * (self.high + self.low), max(0.5 * (self.high - self.low), _LEAST_RANGE)
         return np.asarray(np.clip((value - middle) / half, -1.0, 1.0))
 
 
-def waves(axis: Axis, scaled: Floats, count: int) -> tuple[Floats, Floats]:
-    """Eigenfunctions of the lowest frequencies.
+def waves(axis: Variable, scaled: Floats, count: int) -> tuple[Floats, Floats]:
+    """Evaluate the eigenfunctions of the lowest frequencies.
 
     Args:
         axis: the variable.
-        scaled: (n,) its values; the functions of NaN are 0.
-        count: how many; a periodic variable has an even number.
+        scaled: (n,) scaled values; all functions are 0 at NaN.
+        count: number of functions, even for a periodic variable.
 
     Returns:
         (n, count) values, (count,) frequencies in rad per unit of the scaled variable.
@@ -75,29 +75,34 @@ def waves(axis: Axis, scaled: Floats, count: int) -> tuple[Floats, Floats]:
 
 
 def products(one: Floats, other: Floats) -> Floats:
-    """(n, a * b) of (n, a) and (n, b), the second running fastest."""
+    """Return the (n, a * b) products of (n, a) and (n, b), with the index of the second varying fastest."""
     return np.asarray((one[:, :, None] * other[:, None, :]).reshape(len(one), -1))
 
 
 def log_amplitudes(square_frequency: Floats, log_length: Floats | float) -> Floats:
-    """Logarithm of a weight's standard deviation beside that of frequency 0 (Matern 5/2)."""
+    """Return the logarithm of a weight's standard deviation relative to that at frequency 0 (Matern 5/2).
+
+    Args:
+        square_frequency: (m,) squared frequencies, in rad per unit of the scaled variable.
+        log_length: logarithm of the correlation length.
+    """
     return np.asarray(-_ROUGHNESS * np.log1p(square_frequency * np.exp(2.0 * np.asarray(log_length))))
 
 
 def slope_by_log_length(square_frequency: Floats, log_length: Floats | float) -> Floats:
-    """Derivative of `log_amplitudes` by the logarithm of the length."""
+    """Return the derivative of `log_amplitudes` by the logarithm of the length."""
     size = square_frequency * np.exp(2.0 * np.asarray(log_length))
     return np.asarray(-2.0 * _ROUGHNESS * size / (1.0 + size))
 
 
 @dataclass(frozen=True)
 class Curve:
-    """One term of a sum: an error as a function of one variable or the product of two.
+    """One term of a sum: an error as a function of one or two variables.
 
     Attributes:
-        lever: a joint that errs, or behind the joints one of the base frame's x, y, z.
-        axes: one or two variables, as indices.
-        counts: how many eigenfunctions of each.
+        lever: index of the joint with the error; indices after the joints are the base frame's x, y, z.
+        axes: indices of one or two variables.
+        counts: number of eigenfunctions of each variable.
     """
 
     lever: int
@@ -109,12 +114,12 @@ class Curve:
         """Number of weights."""
         return math.prod(self.counts)
 
-    def check(self, axes: Sequence[Axis]) -> None:
-        """ValueError unless it is a curve over some of these variables."""
+    def check(self, axes: Sequence[Variable]) -> None:
+        """Raise ValueError unless it is a valid curve over some of these variables."""
         sound = len(self.axes) == len(self.counts) in (1, 2) and self.lever >= 0
         sound = sound and all(0 <= a < len(axes) for a in self.axes) and all(0 < c <= _MOST_WAVES for c in self.counts)
         if not sound or any(axes[a].is_periodic and c % 2 for a, c in zip(self.axes, self.counts, strict=True)):
-            raise ValueError("a curve of the Gaussian process is over no variables that it has")
+            raise ValueError("a curve of the Gaussian process is not over variables of the process")
 
 
 class CurveSum:
@@ -123,10 +128,10 @@ class CurveSum:
     Args:
         axes: variables.
         curves: terms.
-        weights: (sum of sizes,) deg or mm (of a joint), mm (of a base axis).
+        weights: (sum of sizes,) weights, deg or mm for a joint, mm for a base axis.
     """
 
-    def __init__(self, axes: Sequence[Axis], curves: Sequence[Curve], weights: Floats) -> None:
+    def __init__(self, axes: Sequence[Variable], curves: Sequence[Curve], weights: Floats) -> None:
         self._middle = np.array([0.5 * (axis.high + axis.low) for axis in axes])
         self._half = np.array([max(0.5 * (axis.high - axis.low), _LEAST_RANGE) for axis in axes])
         self._is_periodic = np.array([axis.is_periodic for axis in axes], dtype=np.bool_)
@@ -137,10 +142,10 @@ class CurveSum:
         self._weights = np.ascontiguousarray(weights)
 
     def moved_mm(self, values: Floats, joint_jacobian: Floats) -> Floats:
-        """(n, 3) displacement by the curves, base frame, mm.
+        """Return the (n, 3) displacement by the curves in the base frame, mm.
 
         Args:
-            values: (n, axes) the variables; a term whose variable is NaN is left out.
+            values: (n, axes) variables; terms with a variable that is NaN are left out.
             joint_jacobian: (n, 3, joints) mm per deg or mm.
         """
         out = np.zeros((len(values), 3))
@@ -161,7 +166,7 @@ class CurveSum:
 
 @part()
 def _sines(angle: float, count: int, out: Floats) -> None:
-    """sin(k * angle), k = 1 .. count, by Chebyshev's recurrence."""
+    """Write sin(k * angle), k = 1 .. count, to `out` by Chebyshev's recurrence."""
     twice = 2.0 * math.cos(angle)
     before, now = 0.0, math.sin(angle)
     for k in range(count):
@@ -171,7 +176,7 @@ def _sines(angle: float, count: int, out: Floats) -> None:
 
 @part()
 def _cosines(angle: float, count: int, out: Floats) -> None:
-    """cos(k * angle), k = 1 .. count."""
+    """Write cos(k * angle), k = 1 .. count, to `out`."""
     twice = 2.0 * math.cos(angle)
     before, now = 1.0, 0.5 * twice
     for k in range(count):
@@ -181,7 +186,7 @@ def _cosines(angle: float, count: int, out: Floats) -> None:
 
 @part()
 def _waves(value: float, middle: float, half: float, is_periodic: bool, count: int, out: Floats) -> None:
-    """As `waves`, of one value."""
+    """Write the eigenfunctions (see `waves`) at one value to `out`."""
     if not math.isfinite(value):
         out[:count] = 0.0
     elif is_periodic:

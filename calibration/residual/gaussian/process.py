@@ -1,13 +1,13 @@
-"""A Gaussian process on the joints' errors: the residual is J_q times a sum of curves, found by their evidence.
+"""A Gaussian process on the joints' errors: the residual is J_q times a sum of curves, selected by their evidence.
 
-Whatever bends, slips or reads wrong in an arm does so at a joint, and moves the tip by that joint's lever arm, which
-the kinematics know. So the process is not on the tip's error but on the joints': error = sum over terms of
-lever * f(variables), where a lever is a column of the joint Jacobian or an axis of the base frame, and f is a Gaussian
-process of one variable, or of two, among the joints' values, their loads, directions, rates and all signals. Terms
-are chosen by their evidence (`curve_search`). The parameters of the kinematics are corrected along with the curves:
-their fit has bent to what the curves now explain.
+Bending, slip and wrong readings in an arm act at a joint, and move the tip by that joint's lever arm, which is known
+from the kinematics. So the process models the errors of the joints instead of those of the tip: error = sum over terms
+of lever * f(variables), where a lever is a column of the joint Jacobian or an axis of the base frame, and f is a
+Gaussian process of one or two variables among the joints' values, their loads, directions, rates and all signals.
+Terms are selected by their evidence (`curve_search`). The parameters of the kinematics are corrected together with the
+curves, as their fit had absorbed a part of what the curves now explain.
 
-Curves are finite sums (`curves`), so that the work grows with the number of rows and not with its cube.
+Curves are finite sums (`curves`), so that the work is proportional to the number of rows and not to its cube.
 """
 
 from __future__ import annotations
@@ -26,18 +26,18 @@ from calibration.numerics.stored_arrays import read_npz, write_npz
 from calibration.observations import Floats
 from calibration.residual.features import Features, is_place
 from calibration.residual.gaussian.curve_search import CurveSearch, Rows, Terms
-from calibration.residual.gaussian.curves import Axis, Curve, CurveSum
+from calibration.residual.gaussian.curves import Curve, CurveSum, Variable
 
 _FILE = "gaussian_process.npz"
 _META = "gaussian_process.json"
 
-_WHOLE_TURN_DEG = 300.0  # an angle that covers more than this goes round
-_MOST_ROWS = 1500  # to find the terms by, and of a block of the sums over all rows
+_WHOLE_TURN_DEG = 300.0  # an angle that covers more than this is periodic
+_MOST_ROWS = 1500  # to select terms on, and in a block of the sums over all rows
 
 
 @dataclass(frozen=True)
 class CurveTerms:
-    """Terms over all variables of some rows, by name and whether they go round."""
+    """Terms selected on some rows, with the name of each variable and whether it is periodic."""
 
     variables: tuple[tuple[str, bool], ...]
     terms: Terms
@@ -48,17 +48,18 @@ class GaussianProcess:
     """A fitted process.
 
     Attributes:
-        names: features of the variables, one an axis.
-        axes, curves: terms; the columns of the axes are those of `names`.
-        weights: of the curves' waves, deg, mm.
-        parameters: (p,) corrections of what `Features.parameter_jacobian` has, mm or rad.
-        found: the terms that it was fitted with; not stored.
+        names: names of the features that are the variables, one for each axis.
+        axes: variables, in the order of `names`.
+        curves: terms over these variables.
+        weights: weights of the curves' waves, deg or mm.
+        parameters: (p,) corrections of the parameters of `Features.parameter_jacobian`, mm or rad.
+        found: terms with which it was fitted; not stored.
     """
 
     kind: ClassVar[str] = "gp"
 
     names: tuple[str, ...]
-    axes: tuple[Axis, ...]
+    axes: tuple[Variable, ...]
     curves: tuple[Curve, ...]
     weights: Floats
     parameters: Floats
@@ -69,12 +70,12 @@ class GaussianProcess:
         return CurveSum(self.axes, self.curves, self.weights)
 
     def predict(self, features: Features) -> Floats:
-        """(n, 3) estimate of the residual in the base frame, mm."""
+        """Return the (n, 3) estimate of the residual in the base frame, mm."""
         moved = self._sum.moved_mm(features.columns(self.names), features.joint_jacobian)
         return moved + features.parameter_jacobian @ self.parameters
 
     def fits(self, features: Features) -> bool:
-        """True if its variables are among these columns, and its levers and parameters are the rig's."""
+        """Return True if its variables are among these columns, and its levers and parameters match the rig's."""
         levers = features.joint_jacobian.shape[2] + 3
         return (
             set(self.names) <= set(features.names)
@@ -83,7 +84,7 @@ class GaussianProcess:
         )
 
     def to_files(self) -> dict[str, bytes]:
-        """Weights in an npz file without pickled objects, axes and curves in JSON."""
+        """Return weights as an npz file without pickled objects, and axes and curves as JSON."""
         document = {
             "axes": [
                 {"feature": name, "low": a.low, "high": a.high, "is_periodic": a.is_periodic}
@@ -96,11 +97,11 @@ class GaussianProcess:
 
     @classmethod
     def from_files(cls, files: Mapping[str, bytes]) -> GaussianProcess:
-        """Inverse of `to_files`; KeyError, TypeError or ValueError where parts are missing or do not fit."""
+        """Restore from `to_files`; KeyError, TypeError or ValueError if parts are missing or do not match."""
         document = json.loads(files[_META])
         stored = read_npz(files[_FILE])
         weights, parameters = (np.asarray(stored[k], dtype=np.float64) for k in ("weights", "parameters"))
-        axes = tuple(Axis(float(a["low"]), float(a["high"]), bool(a["is_periodic"])) for a in document["axes"])
+        axes = tuple(Variable(float(a["low"]), float(a["high"]), bool(a["is_periodic"])) for a in document["axes"])
         curves = tuple(
             Curve(int(c["lever"]), tuple(map(int, c["axes"])), tuple(map(int, c["counts"]))) for c in document["curves"]
         )
@@ -109,25 +110,25 @@ class GaussianProcess:
         for curve in curves:
             curve.check(axes)
         if weights.shape != (sum(c.size for c in curves),) or parameters.ndim != 1:
-            raise ValueError("the weights of the Gaussian process do not fit its curves")
+            raise ValueError("the weights of the Gaussian process do not match its curves")
         if not (np.isfinite(weights).all() and np.isfinite(parameters).all()):
-            raise ValueError("the Gaussian process has weights that are no numbers")
+            raise ValueError("the Gaussian process has weights that are not finite")
         return cls(tuple(str(a["feature"]) for a in document["axes"]), axes, curves, weights, parameters)
 
 
 def fit_gaussian_process(
     features: Features, target_mm: Floats, seed: int, start: CurveTerms | None = None
 ) -> GaussianProcess | None:
-    """Find terms, their amplitudes and smoothness, and their weights.
+    """Select terms and estimate their amplitudes, lengths and weights.
 
     Args:
         features: n rows.
         target_mm: (n, 3) residuals in the base frame.
-        seed: of the rows that terms are found by, where there are more than 1,500.
-        start: what was found for most of these rows, which saves much of the search.
+        seed: seed of the draw of rows on which terms are selected, if there are more than 1,500.
+        start: terms found for most of these rows, which save much of the search.
 
     Returns:
-        None where no term is likely, or nothing varies.
+        The fitted process, or None if no term has significant evidence or nothing varies.
     """
     names, axes = _variables(features)
     if not names or not target_mm.any():
@@ -171,8 +172,8 @@ def fit_gaussian_process(
     )
 
 
-def _variables(features: Features) -> tuple[tuple[str, ...], tuple[Axis, ...]]:
-    """Variables of curves: joints and signals that vary, not the places that follow from the joints."""
+def _variables(features: Features) -> tuple[tuple[str, ...], tuple[Variable, ...]]:
+    """Return the variables of curves: joints and signals that vary, without positions that follow from the joints."""
     table = features.table()
     names, axes = [], []
     for name, values in zip(features.names, table.T, strict=True):
@@ -181,5 +182,7 @@ def _variables(features: Features) -> tuple[tuple[str, ...], tuple[Axis, ...]]:
             continue
         goes_round = name in features.names[: features.joint_jacobian.shape[2]] and name.endswith("_deg")
         names.append(name)
-        axes.append(Axis(float(known.min()), float(known.max()), goes_round and bool(np.ptp(known) > _WHOLE_TURN_DEG)))
+        axes.append(
+            Variable(float(known.min()), float(known.max()), goes_round and bool(np.ptp(known) > _WHOLE_TURN_DEG))
+        )
     return tuple(names), tuple(axes)

@@ -1,12 +1,12 @@
-"""The radial basis function network that learns the residual: Gaussian units, linear output by ridge regression.
+"""Radial basis function network for the residual: Gaussian units, linear output by ridge regression.
 
-Zhou et al. 2022, Eqs. 12-13. Beyond the paper, each input has a width of its own, units stand at the centres of
-k-means in distances of these widths, and the weights' penalty is the norm of the function that they make (that of a
-Gaussian process of these units), so that near units do not count twice. There is no constant term: far from
-everything that was trained on, the estimate fades to zero.
+Zhou et al. 2022, Eqs. 12-13. In addition to the paper, each input has its own width, units are placed by k-means with
+distances in these widths, and the penalty on the weights is the norm of the resulting function (as of a Gaussian
+process with these units), so that neighbouring units do not count twice. There is no constant term: far from all
+training rows the estimate fades to zero.
 
-Joints and prism are what positions depend on; frames' origins say the same in more columns, and held-out errors are
-no smaller with them. Signals take part where cross-validation finds them worth it.
+Positions depend on joints and prism. The frames' origins contain the same information in more columns, and do not lower
+held-out errors. Signals are used if they lower the error in cross-validation.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ _FILE = "rbfn.npz"
 
 _UNITS = (60, 250, 400)
 _USUAL_UNITS = 250
-_WORTHWHILE = 0.03  # share of the held-out squared error that further units must save
-_WIDTH_FACTORS = (0.7, 1.0, 1.4)  # on the widths that have the most evidence
+_WORTHWHILE = 0.03  # share of the held-out squared error that more units must save
+_WIDTH_FACTORS = (0.7, 1.0, 1.4)  # on the widths with the highest evidence
 _RIDGE_FACTORS = (0.3, 1.0, 3.0, 10.0)
 _FOLDS = 3
 _TUNING_ROWS = 2000
@@ -39,7 +39,7 @@ _FOLD_EVIDENCE_ROWS, _EVIDENCE_ROWS = 300, 500
 _LLOYD_ROUNDS = 8
 _CONSTANT = 1e-9  # relative
 _JITTER = 1e-9  # of the mean diagonal of the normal equations
-_BLOCK = 256  # rows whose activations stay in the processor's cache
+_BLOCK = 256  # rows whose activations fit in the processor's cache
 
 
 @dataclass(frozen=True)
@@ -47,9 +47,9 @@ class Hyperparameters:
     """Hyperparameters of a network.
 
     Attributes:
-        widths: of the units along each input, in the input's unit; infinite leaves an input out.
-        units: how many, at most.
-        ridge: of the weights, in the norm of the function that they make.
+        widths: widths of the units along each input, in the input's unit; an infinite width excludes an input.
+        units: greatest number of units.
+        ridge: factor on the weights' penalty, the norm of the resulting function.
     """
 
     widths: tuple[float, ...]
@@ -62,28 +62,29 @@ def choose_hyperparameters(
 ) -> tuple[Hyperparameters, float]:
     """Find the hyperparameters with the least held-out error, on at most 2,000 rows.
 
-    Widths are those with the most evidence (`relevance`) times a factor, the ridge is the noise that goes with them
-    times another; both factors and the number of units are chosen on folds with widths of their own. The search for
-    those starts from the widths of all rows: from scratch it takes half as long again and at times finds a lower hill
-    of the evidence. So the rows held out have a small say in the choice; they must not judge what is chosen.
+    Widths are those with the highest evidence (`relevance`) times a factor. The ridge is the corresponding noise times
+    another factor. Both factors and the number of units are chosen on folds, each with its own widths. The search for
+    these starts from the widths of all rows: without that start it takes half as long again and sometimes ends in a
+    lower maximum of the evidence. The held-out rows thus influence the choice slightly, so they must not be used to
+    judge the result.
 
     Args:
         x: (n, d) inputs.
-        y: (n, k) outputs, of mean about zero.
-        groups: (n,) labels that no fold separates; every row is its own by default.
-        seed: of folds, of the rows that widths are found on and of the units' first places.
+        y: (n, k) outputs, with a mean of about zero.
+        groups: (n,) labels; no fold separates rows with the same one. By default every row has its own.
+        seed: seed of folds, of the rows on which widths are estimated and of the initial units.
 
     Returns:
-        The hyperparameters; their mean squared error on rows held out, summed over the outputs.
+        The hyperparameters, and their mean squared error on held-out rows, summed over the outputs.
 
     Raises:
-        ValueError: fewer than two groups.
+        ValueError: there are fewer than two groups.
     """
     labels = np.arange(len(x)).astype(np.str_) if groups is None else groups
     some = spread_rows(labels, _TUNING_ROWS, seed)
     split = folds(labels[some], _FOLDS, seed)
     if split.max() == 0:
-        raise ValueError("the rows are all of one group, which leaves none to choose hyperparameters by")
+        raise ValueError("all rows are in one group, so there are no held-out rows to choose hyperparameters")
     widths, found = _evident_widths(x, y, spread_rows(labels, _EVIDENCE_ROWS, seed))
     trials = [_Fold(x[some], y[some], labels[some], split == fold, seed, found) for fold in range(split.max() + 1)]
     error: dict[tuple[float, float], float] = {}
@@ -105,7 +106,7 @@ def choose_hyperparameters(
 
 
 class _Fold:
-    """Rows held out, and networks of the others."""
+    """Held-out rows, and networks trained on the other rows."""
 
     def __init__(
         self, x: Floats, y: Floats, groups: NDArray[np.str_], held: NDArray[np.bool_], seed: int, whole: Relevance
@@ -116,7 +117,7 @@ class _Fold:
         self._ridge = found.ridge
 
     def errors(self, factor: float, count: int) -> dict[float, float]:
-        """Squared error on the rows held out, by ridge factor, for widths times `factor` and `count` units."""
+        """Return the squared error on held-out rows, by ridge factor, for widths times `factor` and `count` units."""
         given = Hyperparameters(tuple((factor * self._widths).tolist()), count, self._ridge)
         centre, scale, units = _placed(self._x[~self._held], given, self._seed)
         activation = gaussian(_scaled(self._x, centre, scale), units)
@@ -134,7 +135,7 @@ class _NormalEquations:
         self._square, self._moment, self._penalty = design.T @ design, design.T @ y, penalty
 
     def weights(self, ridge: float) -> Floats:
-        """(m, k)."""
+        """Return the weights (m, k)."""
         square = self._square + ridge * self._penalty
         square[np.diag_indices(len(square))] += _JITTER * np.trace(square) / len(square)
         return np.asarray(cho_solve(cho_factor(square, lower=True, overwrite_a=True), self._moment))
@@ -143,14 +144,14 @@ class _NormalEquations:
 def _evident_widths(
     x: Floats, y: Floats, rows: NDArray[np.intp], start: Relevance | None = None
 ) -> tuple[Floats, Relevance]:
-    """(d,) widths in the inputs' units with the most evidence in some rows of (n, d) inputs and (n, k) outputs."""
+    """Return (d,) widths in the inputs' units with the highest evidence in `rows` of inputs (n, d), outputs (n, k)."""
     centre, spread = _standardisation(x)
     found = relevance(np.nan_to_num((x[rows] - centre) / spread), y[rows], start)
     return found.widths * spread, found
 
 
 def _placed(x: Floats, hyperparameters: Hyperparameters, seed: int) -> tuple[Floats, Floats, Floats]:
-    """Centre and scale of the inputs (n, d), and units among them."""
+    """Return centre and scale of the inputs (n, d), and the units in scaled inputs."""
     centre, scale = _standardisation(x)[0], 1.0 / np.array(hyperparameters.widths)
     return centre, scale, k_means(_scaled(x, centre, scale), hyperparameters.units, seed)
 
@@ -162,7 +163,7 @@ def _scaled(x: Floats, centre: Floats, scale: Floats) -> Floats:
 
 
 def _standardisation(x: Floats) -> tuple[Floats, Floats]:
-    """(d,) mean and standard deviation of the finite values of each column; 0 and 1 where there are none."""
+    """Return (d,) mean and standard deviation of the finite values of each column; 0 and 1 if there are none."""
     known = np.isfinite(x)
     count = np.maximum(known.sum(axis=0), 1)
     centre = np.where(known, x, 0.0).sum(axis=0) / count
@@ -172,7 +173,13 @@ def _standardisation(x: Floats) -> tuple[Floats, Floats]:
 
 
 def k_means(rows: Floats, count: int, seed: int) -> Floats:
-    """(m, d) centres of the rows by k-means; the rows themselves where they are not more than `count`."""
+    """Return (m, d) centres of rows by k-means; the rows themselves if there are at most `count`.
+
+    Args:
+        rows: (n, d) points.
+        count: number of centres.
+        seed: seed of the initial centres.
+    """
     if len(rows) <= count:
         return rows
     centres = rows[np.sort(np.random.default_rng(seed).permutation(len(rows))[:count])]
@@ -189,7 +196,7 @@ def k_means(rows: Floats, count: int, seed: int) -> Floats:
 
 @dataclass(frozen=True)
 class Shape:
-    """Names of a network's d inputs and its hyperparameters, as `choose_shape` finds them."""
+    """Names of a network's d inputs and its hyperparameters, as chosen by `choose_shape`."""
 
     names: tuple[str, ...]
     hyperparameters: Hyperparameters
@@ -200,10 +207,10 @@ class Rbfn:
     """A fitted network.
 
     Attributes:
-        names: of the features that are its d inputs.
+        names: names of the features that are its d inputs.
         centre: (d,) means of the inputs; a missing input (NaN) counts as its mean.
-        scale: (d,) one over the widths.
-        units: (m, d) in scaled inputs.
+        scale: (d,) 1 / width.
+        units: (m, d) units in scaled inputs.
         output: (m, 3) weights, mm.
     """
 
@@ -220,7 +227,7 @@ class Rbfn:
         return half_squares(self.units)
 
     def predict(self, features: Features) -> Floats:
-        """(n, 3) estimate of the residual in the base frame, mm."""
+        """Return the (n, 3) estimate of the residual in the base frame, mm."""
         scaled = _scaled(features.columns(self.names), self.centre, self.scale)
         if len(scaled) <= _BLOCK:
             return self._outputs(scaled)
@@ -230,27 +237,27 @@ class Rbfn:
         return gaussian(scaled, self.units, self._half_squares) @ self.output
 
     def fits(self, features: Features) -> bool:
-        """True if its inputs are among these columns."""
+        """Return True if its inputs are among these columns."""
         return set(self.names) <= set(features.names)
 
     def to_files(self) -> dict[str, bytes]:
-        """One npz file without pickled objects."""
+        """Return one npz file without pickled objects."""
         parts = {"centre": self.centre, "scale": self.scale, "units": self.units, "output": self.output}
         return {_FILE: write_npz({"names": np.array(self.names, dtype=np.str_), **parts})}
 
     @classmethod
     def from_files(cls, files: Mapping[str, bytes]) -> Rbfn:
-        """Inverse of `to_files`; KeyError or ValueError where parts are missing or do not fit."""
+        """Restore from `to_files`; KeyError or ValueError if parts are missing or do not match."""
         stored = read_npz(files[_FILE])
         names = tuple(stored["names"].astype(str).tolist())
-        # In the order that they were stored in: another one rounds otherwise.
+        # Keep the stored memory order, as a different order changes rounding.
         parts = ("centre", "scale", "units", "output")
         centre, scale, units, output = (np.asarray(stored[k], dtype=np.float64) for k in parts)
         inputs = (len(names),)
         if centre.shape != inputs or scale.shape != inputs or (*units.shape, 3) != (len(output), *inputs, 3):
-            raise ValueError("shapes of the network do not fit each other")
+            raise ValueError("the shapes of the network's arrays do not match")
         if output.shape[1:] != (3,) or not all(np.isfinite(part).all() for part in (centre, scale, units, output)):
-            raise ValueError("the network has weights that are no numbers")
+            raise ValueError("the network has weights that are not finite")
         return cls(names, centre, scale, units, output)
 
 
@@ -259,9 +266,9 @@ def choose_shape(features: Features, target_mm: Floats, groups: NDArray[np.str_]
 
     Args:
         features: n rows.
-        target_mm: (n, 3) residuals in the base frame, of mean about zero.
-        groups: (n,) labels that no fold separates, at least two.
-        seed: of folds and networks.
+        target_mm: (n, 3) residuals in the base frame, with a mean of about zero.
+        groups: (n,) labels, at least two; no fold separates rows with the same one.
+        seed: seed of folds and networks.
     """
     places = [name for name in features.names[: features.geometry.shape[1]] if not is_frame_origin(name)]
     signals = features.names[features.geometry.shape[1] :]
@@ -273,7 +280,7 @@ def choose_shape(features: Features, target_mm: Floats, groups: NDArray[np.str_]
 
 
 def fit_shape(features: Features, target_mm: Floats, shape: Shape, seed: int) -> Rbfn:
-    """Fit with given inputs and hyperparameters; arguments as for `choose_shape`."""
+    """Fit a network with given inputs and hyperparameters; arguments as for `choose_shape`."""
     x = features.columns(shape.names)
     centre, scale, units = _placed(x, shape.hyperparameters, seed)
     normal = _NormalEquations(gaussian(_scaled(x, centre, scale), units), target_mm, gaussian(units, units))

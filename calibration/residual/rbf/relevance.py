@@ -1,7 +1,7 @@
-"""Relevance of each input to a Gaussian kernel: widths per dimension by the evidence of a Gaussian process.
+"""Relevance of each input to a Gaussian kernel: one width per dimension, by the evidence of a Gaussian process.
 
 Rasmussen & Williams 2006, section 5.1 (automatic relevance determination, Eqs. 5.8 and 5.9), with one kernel for all
-outputs. An exponential prior on the relevances keeps inputs out that only noise asks for.
+outputs. An exponential prior on the relevances excludes inputs that only explain noise.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from scipy.optimize import minimize
 
 from calibration.observations import Floats
 
-WIDEST = 30.0  # in standard deviations of the input: all but no influence among the data, and none far from them
+WIDEST = 30.0  # in standard deviations of the input, which then has almost no influence within the data
 _NARROWEST = 0.15
-_STARTS = (0.3, 1.0, 2.0)  # relevances to start from: the evidence has more than one hill
-_FIRST_ROWS = 300  # that tell which start is on the higher hill
+_STARTS = (0.3, 1.0, 2.0)  # initial relevances, as the evidence has several maxima
+_FIRST_ROWS = 300  # on which the starts are compared
 _FIRST_STEPS, _STEPS = 15, 25
 _CONVERGED = 1e-5
 _PRIOR = 1.0  # of each relevance: density exp(-relevance)
@@ -33,8 +33,8 @@ class Relevance:
     """Result of `relevance`.
 
     Attributes:
-        widths: (d,) of each input, in standard deviations; infinite where the input is constant.
-        signal, noise: variances, in mean squares of the outputs.
+        widths: (d,) width of each input, in standard deviations; infinite if the input is constant.
+        signal, noise: variances, relative to the mean square of the outputs.
     """
 
     widths: Floats
@@ -43,17 +43,17 @@ class Relevance:
 
     @property
     def ridge(self) -> float:
-        """Noise over signal."""
+        """Ratio of noise to signal."""
         return self.noise / self.signal
 
 
 def relevance(x: Floats, y: Floats, start: Relevance | None = None) -> Relevance:
-    """Widths with the most evidence; each of some 25 steps costs n^3, so give it a few hundred rows.
+    """Find the widths with the highest evidence; each of about 25 steps costs n^3, so pass a few hundred rows.
 
     Args:
         x: (n, d) standardised inputs, rows in random order.
-        y: (n, k) outputs of mean about zero.
-        start: result for other rows; found from scratch by default.
+        y: (n, k) outputs with a mean of about zero.
+        start: result for similar rows to start from; by default several starts are compared.
     """
     varying = np.ptp(x, axis=0) > _CONSTANT
     size = float(np.sqrt((y**2).mean()))
@@ -83,7 +83,7 @@ def _climb(evidence: _Evidence, at: Floats, bounds: list[tuple[float, float]], s
 
 
 class _Evidence:
-    """Minus the log evidence and its gradient by log relevances, log signal and log noise variance."""
+    """Negative log evidence and its gradient by log relevances, log signal and log noise variance."""
 
     def __init__(self, x: Floats, y: Floats) -> None:
         self._x, self._y = x, y
@@ -97,7 +97,7 @@ class _Evidence:
         covariance[self._diagonal] += noise + _JITTER
         factor = np.linalg.cholesky(covariance)
         half_log_det = float(np.log(np.diag(factor)).sum())
-        # Rows of a lower triangle are columns of an upper one, as LAPACK has them: nothing is copied.
+        # The transpose of a lower triangle is an upper one in LAPACK's column order, so nothing is copied.
         lower = np.asarray(lapack.dpotri(factor.T, overwrite_c=True)[0], dtype=np.float64).T
         inverse = lower + lower.T
         inverse[self._diagonal] *= 0.5
@@ -114,12 +114,12 @@ class _Evidence:
 
 
 def half_squares(rows: Floats) -> Floats:
-    """(n,) half the squared length of each row."""
+    """Return (n,) half the squared length of each row."""
     return np.asarray(0.5 * np.einsum("ij,ij->i", rows, rows))
 
 
 def gaussian(a: Floats, b: Floats, half_squares_b: Floats | None = None) -> Floats:
-    """(n, m) exp(-|a - b|^2 / 2) of every row of a with every row of b, whose half squares may be known."""
+    """Return (n, m) exp(-|a - b|^2 / 2) of all rows of a (n, d) and b (m, d); half squares of b may be given."""
     exponent = a @ b.T
     exponent -= half_squares(a)[:, None]
     exponent -= half_squares(b) if half_squares_b is None else half_squares_b
@@ -128,7 +128,13 @@ def gaussian(a: Floats, b: Floats, half_squares_b: Floats | None = None) -> Floa
 
 
 def spread_rows(groups: NDArray[np.str_], count: int, seed: int) -> NDArray[np.intp]:
-    """At most `count` rows in random order, drawn as evenly over the groups as can be: one of each, then another."""
+    """Return row numbers in random order, spread evenly over groups: one of each, then a second of each, and so on.
+
+    Args:
+        groups: (n,) label of each row's group.
+        count: greatest number of rows to return.
+        seed: seed of the random order.
+    """
     shuffled = np.random.default_rng(seed).permutation(len(groups))
     _, index, size = np.unique(groups[shuffled], return_inverse=True, return_counts=True)
     by_group = np.argsort(index, kind="stable")

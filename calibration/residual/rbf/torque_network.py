@@ -1,10 +1,10 @@
-"""The second paper's network on joint torques for the error that calibrated kinematics leave (RBF-TCM).
+"""The second paper's network on joint torques for the errors of calibrated kinematics (RBF-TCM).
 
-ICIC 2020, Eqs. 9-14: the inputs are the gravity torques of all joints, a unit is exp(-(|w - p| b)^2) about a training
-row's torques, units are added one at a time where the error is largest, at most 40, and the linear output (with a
-constant) is solved again each time. The paper does not say how wide a unit is, nor when to stop. Here 1 / b is a
-multiple of the median distance between the training rows' torques; the multiple and the number of units are those with
-the least squared error in leave-one-out over groups of the training rows.
+ICIC 2020, Eqs. 9-14: the inputs are the gravity torques of all joints, and a unit is exp(-(|w - p| b)^2) about the
+torques of a training row. Up to 40 units are added one at a time where the error is largest, and the linear output
+(with a constant) is solved again each time. The paper specifies neither the width of a unit nor when to stop. Here
+1 / b is a multiple of the median distance between the training rows' torques; the multiple and the number of units are
+those with the least squared error in leave-one-out over groups of the training rows.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from calibration.residual.features import Features
 from calibration.residual.folds import folds
 
 _MOST_UNITS = 40
-_TRIES = 4  # candidates for each unit: a row whose torques repeat those of a unit makes no new one
+_TRIES = 4  # candidates for each unit, as rows whose torques repeat those of a unit are skipped
 _MOST_FOLDS = 50
 _MOST_DISTANCES = 1000
 _WIDTHS = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)  # 1 / b, in median distances between training rows
-_NEW = 1e-6  # share of a unit's activation that those before it must not explain
+_NEW = 1e-6  # least share of a unit's activation that is independent of the units before it
 _FILE = "torque_network.npz"
 
 
@@ -35,10 +35,10 @@ class TorqueNetwork:
     """A fitted network.
 
     Attributes:
-        names: its feature columns, `torque_<joint>_Nm`.
-        units: (m, t) torques at which the units stand, N m.
+        names: names of its feature columns, `torque_<joint>_Nm`.
+        units: (m, t) torques at the centres of the units, N m.
         inverse_width: b, 1 / (N m).
-        output: (1 + m, 3) a constant and the weights of the units, mm.
+        output: (1 + m, 3) constant and weights of the units, mm.
     """
 
     kind: ClassVar[str] = "rbf-tcm"
@@ -49,27 +49,27 @@ class TorqueNetwork:
     output: Floats
 
     def predict(self, features: Features) -> Floats:
-        """(n, 3) estimate of the residual in the base frame, mm."""
+        """Return the (n, 3) estimate of the residual in the base frame, mm."""
         estimate: Floats = _design(features.columns(self.names), self.units, self.inverse_width) @ self.output
         return estimate
 
     def fits(self, features: Features) -> bool:
-        """True if its torques are among these columns."""
+        """Return True if its torques are among these columns."""
         return set(self.names) <= set(features.names)
 
     def to_files(self) -> dict[str, bytes]:
-        """One npz file without pickled objects."""
+        """Return one npz file without pickled objects."""
         parts = {"units": self.units, "inverse_width": np.array([self.inverse_width]), "output": self.output}
         return {_FILE: write_npz({"names": np.array(self.names, dtype=np.str_), **parts})}
 
     @classmethod
     def from_files(cls, files: Mapping[str, bytes]) -> TorqueNetwork:
-        """Inverse of `to_files`; KeyError or ValueError where parts are missing or do not fit."""
+        """Restore from `to_files`; KeyError or ValueError if parts are missing or do not match."""
         stored = read_npz(files[_FILE])
         names = tuple(stored["names"].astype(str).tolist())
         units, width, output = (np.asarray(stored[k], dtype=np.float64) for k in ("units", "inverse_width", "output"))
         if units.shape[1:] != (len(names),) or output.shape != (len(units) + 1, 3) or width.shape != (1,):
-            raise ValueError("shapes of the network do not fit each other")
+            raise ValueError("the shapes of the network's arrays do not match")
         return cls(names, units, float(width[0]), output)
 
 
@@ -81,12 +81,12 @@ def fit_torque_network(
     Args:
         features: n rows.
         target_mm: (n, 3) residuals in the base frame.
-        groups: (n,) labels of rows that are left out together, at least two; of more than 50, some share a turn.
+        groups: (n,) labels of rows that are left out together, at least two. More than 50 are combined into 50 folds.
         names: columns of the torques.
-        seed: of which share a turn.
+        seed: seed of the folds.
 
     Returns:
-        The network; (n, 3) estimates of every row by a network of its shape that was trained without it.
+        The network, and (n, 3) out-of-fold estimates by networks of the same width and number of units, mm.
     """
     torques = features.columns(names)
     split = folds(groups, _MOST_FOLDS, seed)
@@ -104,14 +104,14 @@ def fit_torque_network(
 
 
 def _left_out(torques: Floats, target_mm: Floats, split: NDArray[np.intp], inverse_width: float) -> Floats:
-    """(units, n, 3) estimates of every row by networks of 1, 2, ... units that were trained without its fold."""
+    """Return (units, n, 3) estimates of every row by networks of 1, 2, ... units trained without its fold."""
     out = np.empty((_MOST_UNITS, *target_mm.shape))
     for fold in np.unique(split):
         held = split == fold
         inside = torques[~held]
         rows, triangle, moments = _grow(inside, target_mm[~held], inverse_width, _MOST_UNITS)
         unseen = _design(torques[held], inside[rows], inverse_width)
-        # Leading blocks of the triangle are the smaller networks.
+        # Leading blocks of the triangle belong to the smaller networks.
         parts = np.cumsum(np.linalg.solve(triangle.T, unseen.T).T[:, :, None] * moments, axis=1)
         last = len(rows)
         out[:last, held] = parts[:, 1:].transpose(1, 0, 2)
@@ -122,11 +122,11 @@ def _left_out(torques: Floats, target_mm: Floats, split: NDArray[np.intp], inver
 def _grow(
     torques: Floats, target_mm: Floats, inverse_width: float, most: int
 ) -> tuple[NDArray[np.intp], Floats, Floats]:
-    """Add units where the error is largest; the output is solved again each time, by orthogonalisation.
+    """Add units where the error is largest, and solve the output again each time by orthogonalisation.
 
     Returns:
-        Rows at which the units stand; the triangle R (1 + m, 1 + m) of constant and activations, and Q' target
-        (1 + m, 3), whose leading parts are the solutions with fewer units.
+        Rows at the centres of the units; the triangle R (1 + m, 1 + m) of constant and activations; and Q' target
+        (1 + m, 3). The leading parts of both belong to the networks with fewer units.
     """
     n = len(torques)
     most = max(min(most, n - 2), 0)
@@ -146,7 +146,7 @@ def _grow(
         before = basis[: len(rows) + 1]
         along = before @ column
         across = column - along @ before
-        again = before @ across  # twice is enough for orthogonality to rounding
+        again = before @ across  # repeating it once makes the columns orthogonal to rounding
         across -= again @ before
         size = float(np.linalg.norm(across))
         if size < _NEW * float(np.linalg.norm(column)):
@@ -161,7 +161,7 @@ def _grow(
 
 
 def _design(torques: Floats, units: Floats, inverse_width: float) -> Floats:
-    """(n, 1 + m) a constant and the activations."""
+    """Return (n, 1 + m) constant and activations."""
     return np.column_stack([np.ones(len(torques)), _activation(torques, units, inverse_width)])
 
 

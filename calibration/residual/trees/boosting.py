@@ -1,7 +1,7 @@
 """Gradient-boosted trees (LightGBM) for the three components of the residual (Zhou et al. 2022, Eqs. 14-17).
 
-Hyperparameters are tuned by grouped cross-validation within a budget of work. The work is counted, not timed: the same
-data and seed give the same trees on a slow machine as on a fast one, and whatever runs them.
+Hyperparameters are tuned by grouped cross-validation within a budget of work. The work is counted, not timed, so that
+the same data and seed give the same trees on slow and fast machines and with any executor.
 """
 
 from __future__ import annotations
@@ -24,16 +24,17 @@ from calibration.residual.trees.tree_text import Tree, read_trees
 
 _AXES = "xyz"
 _META = "lightgbm.json"
-_THREADS = 1  # folds and axes run side by side instead, which does not change a sum
+_THREADS = 1  # folds and axes run in parallel instead, which does not change the order of summation
 
-# A lower learning rate is worth more than anything else here, and takes longer: it gets what comparing leaves over.
+# A lower learning rate helps most but takes longer, so it gets the budget that remains after comparing other settings.
 _SCREEN_RATE, _LOWEST_RATE, _HIGHEST_RATE = 0.1, 0.05, 0.1
-_SCREEN_FOLDS, _SCREEN_SHARE = 2, 0.4  # fewest folds for it; its share of the budget
-_TYPICAL_ROUNDS = 600  # of three axes while screening, for a first guess of the work
-_STEP = 0.25  # from one look at the held-out rows to the next, in rounds times learning rate
-_PATIENCE = 2.5  # without a lower held-out error, in the same
-_LONGEST = 100.0  # in the same
-# Tried one after the other, each against the best so far.
+_SCREEN_FOLDS, _SCREEN_SHARE = 2, 0.4  # fewest folds for screening; its share of the budget
+_TYPICAL_ROUNDS = 600  # of three axes while screening, for a first estimate of the work
+# In rounds times learning rate:
+_STEP = 0.25  # between two evaluations of the held-out rows
+_PATIENCE = 2.5  # without a lower held-out error before growing stops
+_LONGEST = 100.0  # at most
+# Tried one after the other, each compared with the best so far.
 _ALTERNATIVES: tuple[Mapping[str, Any], ...] = (
     {"leaves": 8},
     {"bins": 63},
@@ -43,14 +44,14 @@ _ALTERNATIVES: tuple[Mapping[str, Any], ...] = (
 
 
 @dataclass(frozen=True)
-class Settings:
-    """Settings of the growth of trees.
+class BoostingSettings:
+    """Hyperparameters of the trees.
 
     Attributes:
         rate: learning rate.
-        leaves: of a tree.
-        bins: distinct values of a column that splits tell apart.
-        column_share: of the columns, drawn at random for each tree.
+        leaves: number of leaves of a tree.
+        bins: number of bins of a column between which splits are made.
+        column_share: share of the columns, drawn at random for each tree.
     """
 
     rate: float = _SCREEN_RATE
@@ -59,7 +60,7 @@ class Settings:
     column_share: float = 1.0
 
     def parameters(self, rows: int, seed: int) -> dict[str, Any]:
-        """Parameters as LightGBM names them."""
+        """Return the parameters under LightGBM's names."""
         return {
             "objective": "l2",
             "metric": "None",
@@ -80,9 +81,9 @@ class Settings:
         }
 
     def work(self, table: Floats) -> float:
-        """Seconds that a round on these rows takes on one core of a server, for budgets.
+        """Return the seconds that a round on these rows takes on one core of a server, for budgets.
 
-        Splits are searched among the bins of a leaf's columns, into which the rows of the smaller leaves are counted.
+        LightGBM builds histograms of the rows in the smaller leaves, and searches for splits among their bins.
         """
         rows, columns = table.shape
         bins = sum(min(float(self.bins), len(np.unique(column)), rows / 3.0) for column in table.T)
@@ -94,19 +95,19 @@ class Tuned:
     """Result of cross-validation.
 
     Attributes:
-        names: of the features that the trees see.
-        settings: for all axes.
+        names: names of the features that the trees use.
+        settings: settings for all axes.
         rounds: number of trees of each axis.
     """
 
     names: tuple[str, ...]
-    settings: Settings
+    settings: BoostingSettings
     rounds: tuple[int, ...]
 
 
 @dataclass(frozen=True)
 class Importance:
-    """Share of a feature in the gain of all splits, over the three axes."""
+    """Share of a feature in the total gain of all splits of the three axes."""
 
     feature: str
     share: float
@@ -117,8 +118,8 @@ class Boosting:
     """Fitted trees of the three axes.
 
     Attributes:
-        names: of the features it uses, in order.
-        texts: LightGBM's text of x, y, z.
+        names: names of the features, in the order of the columns.
+        texts: LightGBM's model texts for x, y, z.
     """
 
     kind: ClassVar[str] = "lightgbm"
@@ -134,11 +135,11 @@ class Boosting:
         object.__setattr__(self, "_forest", Forest.build(trees))
 
     def predict(self, features: Features) -> Floats:
-        """(n, 3) estimate of the residual in the base frame, mm; ValueError where a feature is not there."""
+        """Return the (n, 3) estimate of the residual in the base frame, mm; ValueError if a feature is missing."""
         return self._forest.predict(features.table(), column_places(features.names, self.names))
 
     def fits(self, features: Features) -> bool:
-        """True if it was trained on just these columns, with or without the frames' origins."""
+        """Return True if it was trained on exactly these columns, with or without the frames' origins."""
         return self.names in (features.names, tree_columns(features.names))
 
     @property
@@ -152,19 +153,19 @@ class Boosting:
         return tuple(Importance(self.names[i], float(gain[i]) / total) for i in order.tolist())
 
     def to_files(self) -> dict[str, bytes]:
-        """One LightGBM text file an axis and the names of the features."""
+        """Return one LightGBM text file per axis and a file with the names of the features."""
         files = {f"lightgbm_{axis}.txt": text for axis, text in zip(_AXES, self.texts, strict=True)}
         return files | {_META: json.dumps({"features": self.names}, indent=1).encode()}
 
     @classmethod
     def from_files(cls, files: Mapping[str, bytes]) -> Boosting:
-        """Inverse of `to_files`; needs no LightGBM. ValueError for a damaged file."""
+        """Restore from `to_files` without LightGBM; raise ValueError for a damaged file."""
         names = tuple(str(name) for name in json.loads(files[_META])["features"])
         return cls(names, tuple(files[f"lightgbm_{axis}.txt"] for axis in _AXES))
 
 
 def import_lightgbm() -> Any:
-    """Import lightgbm when it is needed: it costs a second, and its wheel lacks libgomp.
+    """Import lightgbm only when needed, because importing takes a second and its wheel lacks libgomp.
 
     Raises:
         CalibrationError: libgomp1 is missing.
@@ -182,10 +183,10 @@ def import_lightgbm() -> Any:
 
 
 def tree_columns(names: Sequence[str]) -> tuple[str, ...]:
-    """Names of the features that trees see unless told otherwise: all but the frames' origins.
+    """Return the names of the features that trees use by default: all but the frames' origins.
 
-    Joints and prism say the same in fewer columns. With the origins growing takes twice as long; held-out errors were
-    2 to 3 % larger on measured poses of a UR10 and within 1 % on simulated booms.
+    Joints and prism contain the same information in fewer columns. With the origins, growing takes twice as long, and
+    held-out errors were 2 to 3 % larger on measured poses of a UR10 and within 1 % on simulated booms.
     """
     return tuple(name for name in names if not is_frame_origin(name))
 
@@ -196,8 +197,8 @@ def fit_boosting(features: Features, target_mm: Floats, tuned: Tuned, seed: int,
     Args:
         features: n rows.
         target_mm: (n, 3) residuals in the base frame.
-        tuned: as `cross_validate` finds it.
-        seed: of rows and columns that a tree sees.
+        tuned: result of `cross_validate`.
+        seed: seed of the rows and columns that are drawn for a tree.
         executor: runs the axes.
     """
     grow = partial(_grow, features.columns(tuned.names), tuned.settings, seed)
@@ -211,26 +212,26 @@ def cross_validate(
     seed: int,
     executor: Executor,
     *,
-    settings: Settings | None = None,
+    settings: BoostingSettings | None = None,
     names: Sequence[str] | None = None,
 ) -> tuple[Floats, Tuned]:
-    """Find out-of-fold estimates, and the settings and number of trees where their error is least.
+    """Compute out-of-fold estimates, with the settings and number of trees that have the least error.
 
-    The number of trees is found on all held-out rows together, which costs the training rows nothing. A fold's own
-    estimate has the number that is best for the other folds: its rows do not choose what they judge. (They end its
-    growing, long after its best.) Settings are chosen on the rows that judge them: see `_tune`.
+    The number of trees is chosen on all held-out rows together, so no training rows are lost for that. The estimate of
+    a fold uses the number that is best for the other folds, so that its rows do not choose what they are to judge.
+    (They do end its growing, but long after its best.) For the choice of settings see `_tune`.
 
     Args:
-        parts: fold -> features of its training rows and of its held-out rows.
+        parts: features of the training rows and of the held-out rows, by fold.
         target_mm: (n, 3) residuals in the base frame.
         split: (n,) fold that holds each row out.
-        seed: of rows and columns that a tree sees.
+        seed: seed of the rows and columns that are drawn for a tree.
         executor: runs folds and axes.
-        settings: to be used; tuned if left out.
-        names: of the features that trees may see; `tree_columns` if left out.
+        settings: settings to use; tuned if left out.
+        names: names of the features that trees may use; `tree_columns` if left out.
 
     Returns:
-        (n, 3) estimates, mm; what was found.
+        (n, 3) estimates, mm; and the names, settings and numbers of trees.
     """
     seen = tree_columns(parts[0][0].names) if names is None else tuple(names)
     folds = [
@@ -258,35 +259,35 @@ class _Fold:
 
 @dataclass(frozen=True)
 class _Curve:
-    """Course of a fold's estimate of one axis: estimates (looks, rows) and their summed squared errors (looks,)."""
+    """History of a fold's estimate of one axis: estimates (looks, rows) and their summed squared errors (looks,)."""
 
     looks: Floats
     squares: Floats
 
     def look(self, number: int) -> Floats:
-        """Estimates at a look; a fold that has ended stays as it was."""
+        """Return the estimates at a look; after its end a fold keeps its last ones."""
         estimate: Floats = self.looks[min(number, len(self.looks) - 1)]
         return estimate
 
 
 def _best_look(curves: Sequence[_Curve]) -> int:
-    """Number of the look at which the error of all folds together is least."""
+    """Return the number of the look at which the total error of all folds is least."""
     longest = max(len(curve.squares) for curve in curves)
     total = sum(np.pad(curve.squares, (0, longest - len(curve.squares)), mode="edge") for curve in curves)
     return int(np.argmin(total))
 
 
-def _tune(folds: Sequence[_Fold], seed: int, executor: Executor) -> Settings:
-    """Compare settings with a part of the budget; the learning rate is what the rest pays for.
+def _tune(folds: Sequence[_Fold], seed: int, executor: Executor) -> BoostingSettings:
+    """Compare settings with a part of the budget; the rest of it determines the learning rate.
 
-    They are compared on the rows that judge the learner later, a choice among a few which flatters it a little; folds
-    within folds would multiply the work.
+    Settings are compared on the rows that later judge the learner. This choice among a few makes the learner look
+    slightly better than it is, but nested folds would multiply the work.
 
-    Others are taken where they gain more than a standard error (the rule of Breiman et al. 1984, section 3.4.3).
+    A setting replaces the best so far if it gains more than a standard error (Breiman et al. 1984, section 3.4.3).
     """
     table = folds[0].inside
     budget = _budget(table.size)
-    best, left = Settings(), _SCREEN_SHARE * budget
+    best, left = BoostingSettings(), _SCREEN_SHARE * budget
     for_each = left / (1 + len(_ALTERNATIVES)) / (_TYPICAL_ROUNDS * best.work(table))
     screen = folds[: max(_SCREEN_FOLDS, int(for_each))]
     squares, rounds = _screen(screen, best, seed, executor)
@@ -306,21 +307,21 @@ def _tune(folds: Sequence[_Fold], seed: int, executor: Executor) -> Settings:
 
 
 def _budget(values: int) -> float:
-    """Seconds of one core, as `Settings.work` counts them, for a table of so many values."""
+    """Return the budget in seconds of one core, as counted by `BoostingSettings.work`, for `values` table values."""
     return 6.0 + 2.3e-5 * values
 
 
-def _screen(folds: Sequence[_Fold], settings: Settings, seed: int, executor: Executor) -> tuple[Floats, int]:
-    """Squared error of each held-out row, and the rounds of the three axes together, as `_grow_folds` has them."""
+def _screen(folds: Sequence[_Fold], settings: BoostingSettings, seed: int, executor: Executor) -> tuple[Floats, int]:
+    """Return the squared error of each held-out row and the total rounds of the three axes, from `_grow_folds`."""
     estimates, rounds = _grow_folds(folds, settings, seed, executor)
     squares = [((fold.outside_mm - found) ** 2).sum(axis=1) for fold, found in zip(folds, estimates, strict=True)]
     return np.concatenate(squares), sum(rounds)
 
 
 def _grow_folds(
-    folds: Sequence[_Fold], settings: Settings, seed: int, executor: Executor
+    folds: Sequence[_Fold], settings: BoostingSettings, seed: int, executor: Executor
 ) -> tuple[list[Floats], tuple[int, ...]]:
-    """Estimates (rows, 3) of each fold's held-out rows at the other folds' best round; the best of all, by axis."""
+    """Return estimates (rows, 3) of held-out rows at the other folds' best round, and the best round of each axis."""
     tasks = [(fold, axis) for axis in range(3) for fold in folds]
     grown = list(executor.map(partial(_grow_fold, settings, seed), *zip(*tasks, strict=True)))
     of_axis = [grown[axis * len(folds) : (axis + 1) * len(folds)] for axis in range(3)]
@@ -335,8 +336,8 @@ def _step(rate: float) -> int:
     return max(1, round(_STEP / rate))
 
 
-def _grow_fold(settings: Settings, seed: int, fold: _Fold, axis: int) -> _Curve:
-    """Grow trees on a fold's training rows until its held-out error has not fallen for a while."""
+def _grow_fold(settings: BoostingSettings, seed: int, fold: _Fold, axis: int) -> _Curve:
+    """Grow trees on a fold's training rows until its held-out error no longer decreases."""
     lightgbm = import_lightgbm()
     parameters = settings.parameters(len(fold.inside), seed)
     train = lightgbm.Dataset(fold.inside, label=fold.inside_mm[:, axis], params=parameters)
@@ -361,7 +362,7 @@ def _grow_fold(settings: Settings, seed: int, fold: _Fold, axis: int) -> _Curve:
     return _Curve(np.array(looks), np.array(squares))
 
 
-def _grow(table: Floats, settings: Settings, seed: int, label: Floats, rounds: int) -> bytes:
+def _grow(table: Floats, settings: BoostingSettings, seed: int, label: Floats, rounds: int) -> bytes:
     lightgbm = import_lightgbm()
     parameters = settings.parameters(len(table), seed)
     booster = lightgbm.train(parameters, lightgbm.Dataset(table, label=label), num_boost_round=rounds)

@@ -1,10 +1,10 @@
 """Trained trees compiled into loops: LightGBM's prediction in microseconds, without LightGBM.
 
-A row's values are first turned into ranks, the number of a column's thresholds below each: a byte. What is missing gets
-the rank that sends it where its nodes say, so that no node has to know. Many rows go through a tree in blocks: a row
-starts with label 0, and node k gives those of its label whose rank exceeds its own the label k + 1. That compares
-bytes, of which the machine takes 32 or 64 at a time; walking down from the root needs fewer comparisons, but each waits
-for the one before it. Walking is faster for a few rows.
+A row's values are first converted to ranks: the number of thresholds of the column below the value, as a byte. A
+missing value gets the rank that sends it in the direction for missing values, so that nodes need no special case. Many
+rows pass through a tree in blocks: every row starts with label 0, and node k changes the label of rows with its label
+and a rank above its own to k + 1. This compares bytes, of which the processor handles 32 or 64 at once. Walking down
+from the root needs fewer comparisons, but each depends on the one before, so it is faster only for a few rows.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ Integers = NDArray[np.int64]
 Bytes = NDArray[np.uint8]
 
 _ROWS = 256  # of a block
-_FEW = 12  # fewer rows than this walk
+_FEW = 12  # with fewer rows, each walks down from the root
 _RANKS = 255  # thresholds of a column, so that ranks 0 .. 255 fit a byte; a feature with more has several columns
 _ZERO = float(np.float32(1e-35))  # LightGBM's kZeroThreshold: up to it a value is zero
 _ZERO_OR_NAN = 1  # of `Tree.missing`
-_PLAIN: Sequence[Literal["C", "A", "W"]] = ("C", "A", "W")  # the kind of array that numba compiles for
+_PLAIN: Sequence[Literal["C", "A", "W"]] = ("C", "A", "W")  # requirements for arrays that are passed to numba
 
 
 @dataclass(frozen=True)
@@ -36,16 +36,16 @@ class Forest:
     """Sums of trees, one for each output.
 
     Attributes:
-        source: (c, 4) of each column of ranks: its feature, what is missing (as `Tree.missing`), and where its
-            thresholds begin and end.
-        missing_rank: (c,) rank of what is missing.
-        threshold: of all columns, in ascending order within each.
-        column, rank: (m,) of each node: where it looks, and the highest rank that goes left.
-        label: (m,) of the rows that the node divides.
-        child: (2 m,) node to the left and to the right of each, counted in its tree; -1 - label for a leaf.
-        tree: (t + 1, 3) of each tree: its output, first node, first leaf value; the last row closes the others.
-        leaf_value: of all trees, by label.
-        outputs: how many.
+        source: (c, 4) feature of each column of ranks, which values are missing (as `Tree.missing`), and first and end
+            index of its thresholds.
+        missing_rank: (c,) rank of missing values.
+        threshold: thresholds of all columns, in ascending order within each.
+        column, rank: (m,) column of each node, and the highest rank that goes left.
+        label: (m,) label of the rows that each node divides.
+        child: (2 m,) left and right child of each node, numbered within the tree; -1 - label for a leaf.
+        tree: (t + 1, 3) output, first node and first leaf value of each tree; the last row is the end.
+        leaf_value: leaf values of all trees, by label.
+        outputs: number of outputs.
     """
 
     source: Integers
@@ -61,7 +61,7 @@ class Forest:
 
     @classmethod
     def build(cls, models: Sequence[Sequence[Tree]]) -> Forest:
-        """Compile trees: one sequence for each output, summed in its order, which is LightGBM's."""
+        """Compile trees, one sequence for each output; they are summed in its order, which is LightGBM's."""
         trees = [tree for model in models for tree in model]
         kinds, kind_of_node = np.unique(
             np.column_stack([_joined(getattr(t, n) for t in trees) for n in ("feature", "missing", "missing_left")]),
@@ -101,14 +101,14 @@ class Forest:
         )
 
     def predict(self, table: Floats, columns: Integers) -> Floats:
-        """Sums of the trees; one thread, the interpreter's lock is released.
+        """Return the sums of the trees; runs in one thread without the interpreter's lock.
 
         Args:
             table: (n, k) rows, NaN where not measured.
-            columns: (f,) column of the table that each feature is.
+            columns: (f,) column of each feature in the table.
 
         Returns:
-            (n, outputs).
+            (n, outputs) sums.
         """
         out = np.zeros((len(table), self.outputs))
         _predict(
@@ -129,7 +129,7 @@ class Forest:
 
 
 def _joined(arrays: Iterable[NDArray[np.generic]]) -> Floats:
-    # Whole numbers of the size of labels and columns are exact in float64.
+    # Integers as small as labels and columns are exact in float64.
     return np.concatenate([np.empty(0), *arrays]).astype(np.float64)
 
 
@@ -163,7 +163,7 @@ def _rank(
 
 @part()
 def _divide(ranks: Bytes, rank: int, label: int, moved: int, labels: Bytes) -> None:
-    """Give the rows of one label that go right the label `moved`."""
+    """Change the label of rows that have `label` and go right to `moved`."""
     own = np.uint8(moved)
     for r in range(_ROWS):
         labels[r] = own if (ranks[r] > rank) & (labels[r] == label) else labels[r]
@@ -171,8 +171,8 @@ def _divide(ranks: Bytes, rank: int, label: int, moved: int, labels: Bytes) -> N
 
 @part()
 def _walk(ranks: Bytes, columns: Integers, rank: Bytes, child: Integers) -> int:
-    """Label of the leaf where a single row ends."""
-    node = np.uint64(0)  # unsigned: a negative index would be counted from the end, which takes time to find out
+    """Return the label of the leaf in which a single row ends."""
+    node = np.uint64(0)  # unsigned, so that numba does not check for negative indices
     while True:
         goes_right = ranks[np.uint64(_ROWS * columns[node])] > rank[node]
         found = child[np.uint64(2 * node + goes_right)]

@@ -225,12 +225,12 @@ def test_a_model_with_effects_comes_back_as_it_was_written(stiff: Fitted) -> Non
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"family": "gremlins"}, "gremlins@theta2, which this program cannot place"),
-        ({"where": "theta77"}, "joint_compliance@theta77, which this program cannot place"),
-        ({"settings": {"torque_Nm": -1.0, "knot_power": 1.0, "bend_rad": 1.0}}, "in no form it takes"),
+        ({"family": "gremlins"}, "gremlins@theta2, which this program does not have there"),
+        ({"where": "theta77"}, "joint_compliance@theta77, which this program does not have there"),
+        ({"settings": {"torque_Nm": -1.0, "knot_power": 1.0, "bend_rad": 1.0}}, "in an invalid form"),
         ({"settings": {}}, "needs the coefficients compliance_rad_per_Nm"),
         ({"settings": {"torque_Nm": float("nan")}}, "settings"),
-        ({"coefficients": []}, "does not fit the parameters and effects"),
+        ({"coefficients": []}, "does not match the parameters and effects"),
         ({"surprise": 1}, "surprise"),
     ],
 )

@@ -172,7 +172,7 @@ def test_an_effect_is_named_beside_one_that_no_library_has() -> None:
     assert gap.remaining_significant
     assert gap.description is not None
     assert gap.description.startswith(f"{strange['where']} angle error = ")
-    assert "what is left over depends on what no effect of the library explains" in gap.warnings
+    assert "the remaining errors depend on something that no effect of the library explains" in gap.warnings
     true = known["coefficients"]["rad_per_K"]
     (coefficient,) = gap.effects[0].reported
     assert coefficient.value == pytest.approx(true, abs=4.0 * coefficient.standard_error)

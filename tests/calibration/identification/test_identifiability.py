@@ -101,8 +101,8 @@ def test_a_prism_that_was_never_measured_is_named_with_the_rows_only_it_would_sh
     wanted = [chain.rig.prism_names.index(name) for name in ("w", "b")]
     fewer = rows(samples, np.isin(samples.data.prism, wanted))
     found = identifiability(chain, fewer, np.zeros(len(chain)), 0.0)
-    assert "prism.r.x: the data say nothing of x of prism r: prism r was not measured" in found.unidentifiable
-    assert "row7.d: the data say nothing of d at row 7: no prism beyond row 7 was measured" in found.unidentifiable
+    assert "prism.r.x: the data show nothing about x of prism r: prism r was not measured" in found.unidentifiable
+    assert "row7.d: the data show nothing about d at row 7: no prism beyond row 7 was measured" in found.unidentifiable
     assert len(found.unidentifiable) == found.parameters - found.rank
     assert {"prism.r.x", "prism.s.z", "row7.d", "row9.alpha"} <= set(found.marked)
 
@@ -128,7 +128,7 @@ def test_a_set_up_has_a_base_of_its_own_and_is_named() -> None:
     assert any(sentence.endswith(": d at row 1 repeats the place of the base") for sentence in found.unidentifiable)
     one = rows(samples, samples.data.setup == 0)
     sentences = identifiability(chain, one, np.zeros(len(chain)), 0.0).unidentifiable
-    assert "base[b].x: the data say nothing of x of the base at set-up 'b': set-up 'b' has no fixes" in sentences
+    assert "base[b].x: the data show nothing about x of the base at set-up 'b': set-up 'b' has no fixes" in sentences
 
 
 def additions(names: tuple[str, ...], joint: int, columns: np.ndarray) -> EffectColumns:
@@ -148,7 +148,7 @@ def test_coefficients_of_effects_join_the_analysis() -> None:
     (repeat,) = [s for s in found.unidentifiable if "angle_scale" in s]
     assert "row2.theta" in repeat
     assert repeat.endswith(("zero of angle_scale at theta2", "the offset of theta2"))
-    assert "backlash@theta2:gap: the data say nothing of gap of backlash at theta2" in found.unidentifiable
+    assert "backlash@theta2:gap: the data show nothing about gap of backlash at theta2" in found.unidentifiable
     assert "encoder_harmonic@theta2:sine" not in found.marked
 
 

@@ -195,12 +195,12 @@ def test_a_fifth_of_gross_outliers_among_whole_poses_does_not_hurt(session: Sess
 
 def test_numbers_out_of_range_are_an_error_and_no_answer(fitted: tuple[Chain, Samples, Fit]) -> None:
     chain, samples, fit = fitted
-    with pytest.raises(CalibrationError, match="left the range of numbers"):
+    with pytest.raises(CalibrationError, match="left the range of floating point"):
         refine(chain, samples, np.where(np.arange(len(chain)) == 1, np.nan, fit.x))
     empty = EffectColumns(
         ("nothing@theta4:nothing",), np.array([2]), np.full((len(samples), 1), np.nan), np.array([1.0])
     )
-    with pytest.raises(CalibrationError, match="left the range of numbers"):
+    with pytest.raises(CalibrationError, match="left the range of floating point"):
         refine(chain, samples, fit.x, additions=empty)
 
 
@@ -254,7 +254,7 @@ def test_an_estimated_prior_scale_leaves_what_the_data_do_not_see_less_certain(s
 def test_additions_of_other_rows_are_refused(session: Session) -> None:
     chain, samples, start = place(session.rig, session.training)
     other = EffectColumns(("nothing@theta4:nothing",), np.array([2]), np.zeros((3, 1)), np.array([1.0]))
-    with pytest.raises(ValueError, match=r"3 rows where there are \d+ samples"):
+    with pytest.raises(ValueError, match=r"3 rows for \d+ samples"):
         refine(chain, samples, start.x, additions=other)
 
 

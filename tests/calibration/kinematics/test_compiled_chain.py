@@ -151,5 +151,5 @@ def test_a_prediction_that_is_not_finite_is_refused_with_its_row(session: Sessio
     rates = np.zeros(count)
     rates[count - 3] = 1e200  # its square is infinite, and so is the uncertainty
     rows = replace(rows, extra={**rows.extra, f"{session.model.rig.joint_names[0]}_rate": rates})
-    with pytest.raises(CalibrationError, match=f"of {rows.row_name(count - 3)} is not a finite number; look for"):
+    with pytest.raises(CalibrationError, match=f"of {rows.row_name(count - 3)} is not a finite number; check that row"):
         Predictor.of(session.model).predict(rows)

@@ -109,7 +109,7 @@ def test_torques_whose_sign_has_changed_since_training_are_named() -> None:
         model = identify(rig, rig_text("ys100"), fixes(rig, truth, 60, 5, sign), effects="joint_compliance@theta2")
         assert of_load(model, fixes(rig, truth, 40, 6, sign)) == []
         changed = of_load(model, fixes(rig, truth, 40, 6, -sign))
-        assert changed[0].startswith("theta2_Nm has the other sign than in training")
+        assert changed[0].startswith("theta2_Nm has the opposite sign to training")
 
 
 def test_loads_that_training_did_not_have_are_named() -> None:
@@ -177,9 +177,9 @@ def test_a_payload_that_training_did_not_have_is_named(carrying: CalibratedModel
     assert of_payload(carrying, weighed(rows, inside)) == []
     assert of_payload(carrying, weighed(rows, heavy)) == [
         "payload_kg: 7 of 40 rows are outside the 0 .. 110 kg of the training data; the loads that effects and "
-        "residual use are beyond what was seen"
+        "residual use are beyond those in training"
     ]
-    missing = "payload_kg is missing in {} of 40 rows: the rig file's payload is taken there"
+    missing = "payload_kg is missing in {} of 40 rows: the rig file's payload is used there"
     assert of_payload(carrying, weighed(rows, gappy)) == [missing.format(5)]
     assert of_payload(carrying, weighed(rows, None)) == [missing.format(40)]
     again = model_from_files(model_to_files(carrying))

@@ -179,7 +179,7 @@ def test_a_pose_that_asks_for_more_than_its_joints_can_choose_is_named(session: 
     targets = rows(session.model, ["w", "b", "r", "s"], 1, 9)
     noise_mm = np.random.default_rng(1).normal(0.0, 2.0, (4, 3))
     found = inverse(session.model, replace(targets, position_mm=targets.position_mm + noise_mm))
-    assert found.warnings[0].endswith("; 4 prisms of one pose ask for 12 coordinates of 9 joints")
+    assert found.warnings[0].endswith("; 4 prisms of one pose have 12 coordinates for 9 joints")
 
 
 def test_targets_that_are_farther_apart_than_the_prisms_are_named(session: Session) -> None:

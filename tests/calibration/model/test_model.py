@@ -91,7 +91,7 @@ def test_a_manifest_of_arbitrary_bytes_is_refused(session: Session, data: bytes)
 def test_a_model_of_another_version_says_which(session: Session) -> None:
     files = model_to_files(session.model)
     manifest = json.loads(files["manifest.json"]) | {"version": 2}
-    with pytest.raises(ModelError, match="version 2, this program reads version 3"):
+    with pytest.raises(ModelError, match="version 2, this program supports version 3"):
         model_from_files(files | {"manifest.json": json.dumps(manifest).encode()})
 
 
@@ -101,10 +101,10 @@ def test_a_model_of_another_version_says_which(session: Session) -> None:
         ({"prior": "hearsay"}, "prior"),
         ({"excess_sigma_mm": float("nan")}, "excess_sigma_mm"),
         ({"surprise": 1}, "surprise"),
-        ({"parameters": []}, "parameters of model.json are not those of its rig"),
+        ({"parameters": []}, "parameters of model.json differ from those of its rig"),
         (
             {"placements": {"": {"rotation": [[2, 0, 0], [0, 1, 0], [0, 0, 1]], "translation_mm": [0, 0, 0]}}},
-            "no rotation",
+            "not a rotation",
         ),
         ({"ranges": {"theta99": [0, 1]}}, "theta99"),
         (
@@ -159,7 +159,7 @@ BASE = ("placements", "")
 @pytest.mark.parametrize(
     ("path", "value", "message"),
     [
-        ((*BASE, "rotation"), [[1, 0, 0], [0, 1, 0], [0, 0, -1]], "no rotation"),
+        ((*BASE, "rotation"), [[1, 0, 0], [0, 1, 0], [0, 0, -1]], "not a rotation"),
         ((*BASE, "rotation"), [[1e200, 1e200, 0], [1e200, -1e200, 0], [0, 0, 1]], "rotation"),
         ((*BASE, "translation_mm", 0), 1e9, "translation_mm"),
         (("parameters", 3, "value"), 1e300, "value"),
@@ -175,10 +175,10 @@ BASE = ("placements", "")
         (("residual", "prisms"), ["p99"], "prism 'p99', which its rig lacks"),
         (("residual", "excess_variance_mm2", 0), 1e300, "excess_variance_mm2"),
         (("fixes",), {"p99": 3}, "prism 'p99', which its rig lacks"),
-        (("ranges", "theta3"), [9.0, -9.0], "ends before it begins"),
+        (("ranges", "theta3"), [9.0, -9.0], "ends before it starts"),
         (("torques",), ["theta99"], "theta99"),
         (("loads",), {"theta99": [0.0, 1.0]}, "theta99"),
-        (("loads",), {"theta3": [1.0, 0.0]}, "ends before it begins"),
+        (("loads",), {"theta3": [1.0, 0.0]}, "ends before it starts"),
         (("outliers",), [{"row": -5, "sigma": 6.0}], "row"),
     ],
 )
@@ -249,7 +249,7 @@ def test_a_residual_of_another_rigs_features_is_refused(with_residual: Calibrate
     files = model_to_files(with_residual)
     names = json.loads(files["lightgbm.json"])
     names["features"][0] = "q1_deg"
-    with pytest.raises(ModelError, match="other features"):
+    with pytest.raises(ModelError, match="features of the residual differ"):
         model_from_files(resigned(files, "lightgbm.json", json.dumps(names).encode()))
 
 

@@ -77,7 +77,7 @@ def test_data_without_noise_leave_nothing_that_lacks_a_name(session: Session) ->
         session.rig, rig_text("swdt82"), parse_observations(data.csv_text().encode(), session.rig, "exact.csv")
     )
     (warning,) = model.warnings
-    assert "data computed without noise do so too" in warning
+    assert "simulated data without noise have this effect too" in warning
 
 
 def test_rows_without_a_setup_beside_others_are_told(session: Session) -> None:
@@ -86,7 +86,7 @@ def test_rows_without_a_setup_beside_others_are_told(session: Session) -> None:
     with pytest.raises(UnsafeError, match=r"set-up '' \(no setup in the row\) is unknown to the model"):
         evaluate(model, mixed)
     (warning,) = calibrated(session, mixed).warnings
-    assert warning.startswith("50 of 250 rows have no setup, the first in line 202, beside those of 'S1'")
+    assert warning.startswith("50 of 250 rows have no setup, the first in line 202, while others have 'S1'")
 
 
 def test_a_clock_that_was_set_back_is_told_and_a_sorted_table_is_not(session: Session) -> None:
@@ -106,15 +106,15 @@ def test_a_clock_in_milliseconds_is_told(session: Session) -> None:
     time_s = session.held_out.extra["time_s"]
     (warning,) = evaluate(session.model, at_times(1e3 * time_s)(session.held_out)).warnings
     assert warning.startswith("time_s: half of the fixes are more than ")
-    assert warning.endswith("so divide it by 1000 if so")
+    assert warning.endswith("so divide it by 1000 if it is in milliseconds")
 
 
 def test_a_base_that_few_fixes_place_says_how_well_they_do(session: Session) -> None:
     many = replace(session.training, setup=np.full(250, "S1"))
     few, later = (simulated(session.truth, n, seed, setup="S2") for n, seed in ((3, 9), (250, 10)))
     model = calibrated(session, joined_observations([many, few]))
-    told = [w for w in model.warnings if w.startswith("set-up 'S2' rests on 3 fixes")]
-    (said_mm,) = (float(w.split("from there to ")[1].split(" mm")[0]) for w in told)
+    told = [w for w in model.warnings if w.startswith("set-up 'S2' has only 3 fixes")]
+    (said_mm,) = (float(w.split("are uncertain by ")[1].split(" mm")[0]) for w in told)
     total_mm = rms(evaluate(model, later).errors_mm["effects"])
     assert 0.5 * said_mm < np.sqrt(total_mm**2 - model.effects_noise_mm**2) < 2.0 * said_mm
 

@@ -88,7 +88,7 @@ def refused(training: Observations, name: str, change: Change, prior: str = "rec
 )
 def test_a_mistake_is_refused_by_its_name(session: Session, change: Change, words: list[str]) -> None:
     message = refused(session.training, "swdt82", change)
-    assert message.startswith("data and rig file do not fit each other: ")
+    assert message.startswith("data and rig file do not match: ")
     for word in words:
         assert word in message
 
@@ -154,7 +154,8 @@ def test_copied_rows_count_once_and_are_named(session: Session) -> None:
     model = identify(session.rig, rig_text("swdt82"), copied)
     once = identify(session.rig, rig_text("swdt82"), training)
     assert any(
-        w.startswith("100 of 350 rows are copies of earlier ones") and "in line 252, " in w for w in model.warnings
+        w.startswith("100 of 350 rows are exact copies of earlier rows") and "in line 252, " in w
+        for w in model.warnings
     )
     assert any(w.startswith("1 of 250 training fixes are outliers") and w.endswith("in line 9") for w in model.warnings)
     np.testing.assert_array_equal(model.values, once.values)
@@ -194,7 +195,7 @@ def test_a_machine_that_stands_still_is_one_pose_whatever_its_encoders_add(sessi
     joints = {j.name: still.joints[j.name] + j.sigma * rng.normal(size=60) for j in session.rig.joints}
     position_mm = still.position_mm + rng.normal(0.0, 2.0, (60, 3))
     still = replace(still, joints=joints, position_mm=position_mm, pose=np.full(60, ""))
-    with pytest.raises(UnsafeError, match="1 different fix, repeats counted once of 60, is 3 coordinates"):
+    with pytest.raises(UnsafeError, match="1 different fix, repeats counted once of 60, has 3 coordinates"):
         identify(session.rig, rig_text("swdt82"), still)
 
 
@@ -205,7 +206,7 @@ def test_a_base_that_only_noise_turns_is_refused(session: Session, method: str) 
     lone = replace(
         lone, position_mm=lone.position_mm + noise_mm, setup=np.full(12, "new"), pose=np.arange(12).astype(str)
     )
-    turns = "set-up 'new': all fixes lie in one place or on a line, but for their noise"
+    turns = "set-up 'new': all fixes lie in one place or on a line, apart from their noise"
     with pytest.raises(UnsafeError, match=turns):
         identify(session.rig, rig_text("swdt82"), joined_observations([session.training, lone]), method=method)
     with pytest.raises(UnsafeError, match=turns):
@@ -216,7 +217,7 @@ def test_coordinates_in_another_order_are_named_where_positions_come_out_right(s
     cyclic = replace(session.training, position_mm=session.training.position_mm[:, [1, 2, 0]])
     model = identify(session.rig, rig_text("swdt82"), cyclic)
     assert any(
-        re.match("the base: what the rig file calls up is (89|90|91) deg .* order of x, y, z", w)
+        re.match("the base: the upward direction of the rig file is (89|90|91) deg .* order of x, y, z", w)
         for w in model.warnings
     )
 
@@ -257,5 +258,5 @@ def test_the_published_search_says_when_it_has_not_come_to_rest(session: Session
 def test_warnings_of_the_training_are_told_apart_from_those_of_other_rows(session: Session) -> None:
     doubled = session.training.select(np.concatenate([np.arange(250), np.arange(5)]))
     model = identify(session.rig, rig_text("swdt82"), doubled)
-    assert any(w.startswith("5 of 255 rows are copies") for w in evaluate(model, doubled).warnings)
+    assert any(w.startswith("5 of 255 rows are exact copies") for w in evaluate(model, doubled).warnings)
     assert any(w.startswith("in training: 5 of 255 rows") for w in evaluate(model, session.held_out).warnings)

@@ -44,10 +44,15 @@ def moved(which: Callable[[Observations], np.ndarray], place: Callable[[np.ndarr
         # Two of them explain a part, and a part is no answer.
         ("arm7", ("",), scaled(j1=-1.0, j2=-1.0, j3=-1.0), "j1 runs the other way and j2 runs the other way and j3"),
         # Turned j2 would be beyond its limits.
-        ("arm7", ("",), scaled(j1=-1.0), "each other: j1 runs the other way: taken so, .* or j2 reads 180 deg off"),
+        (
+            "arm7",
+            ("",),
+            scaled(j1=-1.0),
+            "do not match: j1 runs the other way: with that corrected, .* or j2 reads 180 deg off",
+        ),
         # A spindle turns often: its readings are many radians.
         ("levers", ("",), scaled(spindle=math.pi / 180.0), "spindle_deg is in radians"),
-        # Far from each other, set-ups say nothing of the size of the machine.
+        # The distance between set-ups is no evidence of the size of the machine.
         ("torso", ("west", "east"), lambda o: replace(o, position_mm=o.position_mm / 1e3), "the positions are in m:"),
         ("arm7", ("",), lambda o: replace(o, position_mm=o.position_mm * 1e3), "the positions are in micrometres"),
         (

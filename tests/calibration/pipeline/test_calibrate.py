@@ -214,7 +214,7 @@ def _measured(truth: RigTruth, observations: Observations) -> np.ndarray:
     [
         (
             lambda o: o.select(np.arange(15)),
-            "15 different fixes are 45 coordinates, which cannot determine 56 parameters; measure 112 or more",
+            "15 different fixes have 45 coordinates, which cannot determine 56 parameters; measure 112 or more",
         ),
         (lambda o: replace(o, position_mm=o.position_mm / 1000.0), "the positions are in m"),
         (lambda o: replace(o, position_mm=o.position_mm[:, [1, 0, 2]]), "mirrored"),
@@ -285,7 +285,7 @@ def test_an_encoder_mounted_the_other_way_round_is_found_as_built_and_refused_ot
         identify(session.rig, TEXT, training)
     model = identify(session.rig, TEXT, training, prior="as-built")
     assert rms(evaluate(model, held_out).errors_mm["geometric"]) < 6.0
-    assert any(w.startswith("row7.theta came out ") and "deg from the rig file" in w for w in model.warnings)
+    assert any(w.startswith("row7.theta is ") and "deg from the rig file" in w for w in model.warnings)
 
 
 @pytest.mark.long
@@ -317,5 +317,5 @@ def test_a_fit_of_half_of_the_data_is_refused(session: Session) -> None:
     position = session.training.position_mm.copy()
     wrong = np.random.default_rng(6).permutation(len(position))[:100]
     position[wrong] += np.random.default_rng(7).normal(0.0, 4000.0, (100, 3))
-    with pytest.raises(UnsafeError, match=r"leave out \d+ of 250 fixes, so it describes a part of the data only"):
+    with pytest.raises(UnsafeError, match=r"leave out \d+ of 250 fixes, so it describes only a part of the data"):
         identify(session.rig, TEXT, replace(session.training, position_mm=position))

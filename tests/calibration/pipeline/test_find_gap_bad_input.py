@@ -37,7 +37,7 @@ def test_what_is_doubtful_of_the_training_and_of_the_held_out_rows_is_told() -> 
     twice = observations.select(np.concatenate([np.arange(len(observations)), np.arange(10)]))
     held_out = replace(session(10, 77), extra={})
     warnings = find_gap(support.SOURCE.rig, support.SOURCE.text, twice, holdout=held_out).warnings
-    assert any("10 of 50 rows are copies of earlier ones" in warning for warning in warnings)
+    assert any("10 of 50 rows are exact copies of earlier rows" in warning for warning in warnings)
     left_out = "in the held-out rows: backlash@theta4 is left out: this data lacks the column theta4_dir"
     assert left_out in warnings
 
@@ -100,7 +100,7 @@ def test_held_out_rows_of_another_setup_are_refused_before_any_work_in_words_tha
     elsewhere = replace(observations, setup=np.full(len(observations), "S2"))
     said: list[str] = []
     with pytest.raises(
-        UnsafeError, match=r"set-up 'S2' of the held-out rows is not among .*'S1'.*hold out rows of those"
+        UnsafeError, match=r"set-up 'S2' of the held-out rows is not among .*'S1'.*hold out rows of these set-ups"
     ):
         find_gap(
             support.SOURCE.rig,

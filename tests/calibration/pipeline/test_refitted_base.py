@@ -129,7 +129,7 @@ def test_a_model_with_a_refitted_base_is_stored_whole(moved: Moved, refitted: li
     np.testing.assert_array_equal(Predictor.of(again).predict(moved.held_out).position_mm, prediction.position_mm)
     plain = Predictor.of(replace(refitted[0], base_covariance=None)).predict(moved.held_out)
     assert rms(plain.sigma_mm) < 0.97 * rms(prediction.sigma_mm)
-    with pytest.raises(ModelError, match="does not fit the set-ups"):
+    with pytest.raises(ModelError, match="does not match the set-ups"):
         model_from_files(model_to_files(replace(refitted[0], base_covariance=np.eye(5))))
 
 

@@ -170,13 +170,13 @@ def test_what_is_outside_is_named(region: Region) -> None:
     shifted, fades = region.warnings(seen(readings, signals), JOINTS)
     assert shifted.startswith("oil_bar: 1 of 4 readings are outside the 5")
     assert "(another site, a shifted sensor, or another unit?)" in shifted
-    assert fades.startswith("the residual fades: 4 of 4 rows lie outside the region it was trained on (a above 4")
+    assert fades.startswith("the residual fades: 4 of 4 rows lie outside the region of its training data (a above 4")
     for reason in (
         "b below 15",
         "deg in 1",
         "oil_bar missing in 1",
-        "oil_bar strange in 1",
-        "3 rows (75%) get none of it",
+        "oil_bar out of range in 1",
+        "3 rows (75%) are not corrected at all",
     ):
         assert reason in fades
 

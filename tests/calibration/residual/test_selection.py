@@ -99,7 +99,7 @@ def test_nothing_is_learned_from_noise(seed: int) -> None:
 def test_one_learner_that_does_not_help_is_left_out_by_its_name() -> None:
     decision = choose("gp", noise=1.0, signal=0.0, n=250)
     assert decision.residual is None
-    assert decision.reason.startswith("gp was asked for and is left out: in cross-validation of the training data")
+    assert decision.reason.startswith("gp was requested and is left out: in cross-validation of the training data")
     assert "no gain beyond chance" in decision.reason
 
 

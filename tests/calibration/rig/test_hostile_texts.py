@@ -156,7 +156,7 @@ def overlapping() -> bytes:
         (member("(1,)", "'|O'", bytes(8)), "does not hold an array of object"),
         (member("(1,)", "'<U0'"), "does not hold an array"),
         (member("(" * 5000), "damaged"),
-        (overlapping(), "an archive holds more than its own size"),
+        (overlapping(), "an archive declares more data than its own size"),
         (b"", "damaged"),
         (b"PK\x03\x04", "damaged"),
     ],

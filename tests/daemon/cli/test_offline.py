@@ -97,7 +97,7 @@ def test_a_residual_that_was_asked_for_and_is_left_out_says_why(work: Path, tmp_
     few = tmp_path / "few.csv"
     few.write_text("".join((work / "train.csv").read_text().splitlines(keepends=True)[:41]))
     asked = ("calibrate", "--rig", "ur10", "--data", few, "--out", tmp_path / "model", "--effects", "none")
-    why = "gp was asked for and is left out:"
+    why = "gp was requested and is left out:"
     told = run(*asked, "--residual", "gp")
     assert (told.exit_code, why in " ".join(told.stdout.split())) == (0, True)
     answer = json.loads(run(*asked, "--residual", "gp", "--json").stdout)

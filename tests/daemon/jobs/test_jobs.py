@@ -79,7 +79,7 @@ def test_a_job_goes_on_from_the_checkpoint_of_its_number_and_leaves_none(rig: Jo
     checkpoint.write_bytes(b"no state of a search")
     order = Order("gap", 1, str(rig.config.store_path), str(checkpoint.parent), ("a",), 0)
     result = perform(order, lambda share, text: None)
-    assert "the checkpoint cannot be read, so the search began anew" in read_model(Path(result["model"])).warnings
+    assert "the checkpoint cannot be read, so the search started again" in read_model(Path(result["model"])).warnings
     assert not checkpoint.exists()
 
 

@@ -92,7 +92,7 @@ def test_a_truncated_file_is_refused(model_directory: Path, name: str) -> None:
 def test_an_edited_file_is_refused(model_directory: Path) -> None:
     path = model_directory / "model.json"
     path.write_bytes(path.read_bytes().replace(b"0.1", b"0.2", 1))
-    with pytest.raises(ModelError, match=r"model\.json is not as it was written"):
+    with pytest.raises(ModelError, match=r"model\.json was changed after it was written"):
         read_model(model_directory)
 
 

@@ -293,7 +293,7 @@ def test_a_reversed_joint_is_said_to_run_the_other_way() -> None:
     _, _, axes = axes_of(truth, 1010)
     wrong = Chain(reversed_rig, chain.placements)
     sentences = disagreements(cross_check(wrong, fit.x, fit.covariance, axes))
-    assert any(s.startswith("theta4 runs the other way than in the model") for s in sentences)
+    assert any(s.startswith("theta4 runs the opposite way to the model") for s in sentences)
     assert not any(s.startswith(("theta1 runs", "theta2 runs", "theta3 runs")) for s in sentences)
 
 
@@ -305,7 +305,7 @@ def test_a_longer_prism_offset_leaves_the_axis_and_shows_in_the_circle() -> None
     _, _, axes = axes_of(truth, 1012)
     check = {c.joint: c for c in cross_check(chain, wrong, fit.covariance, axes)}["theta6"]
     assert check.sentence is not None
-    assert check.sentence.startswith("about theta6, prism tool runs on a circle")
+    assert check.sentence.startswith("about theta6, prism tool moves on a circle")
     x, y, _ = truth.prism_offset_mm("tool")
     assert check.radius_mm == pytest.approx(-2.0 * x / np.hypot(x, y), abs=0.1)
 

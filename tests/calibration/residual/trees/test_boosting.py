@@ -18,7 +18,7 @@ from calibration.residual.features import Features
 from calibration.residual.folds import folds
 from calibration.residual.learners import tree_importance
 from calibration.residual.trees import boosting
-from calibration.residual.trees.boosting import Boosting, Settings, Tuned, cross_validate, fit_boosting
+from calibration.residual.trees.boosting import Boosting, BoostingSettings, Tuned, cross_validate, fit_boosting
 from tests.calibration.conftest import Session, features, rms
 
 NAMES = ("a_deg", "b_deg", "c_deg", "frame1_x_mm")
@@ -49,7 +49,7 @@ def fitted(rows: Features, target: Floats, tuned: Tuned) -> Boosting:
 
 
 def few(rounds: int, names: tuple[str, ...] = (*NAMES[:3], "a_dir")) -> Tuned:
-    return Tuned(names, Settings(rate=0.1), (rounds,) * 3)
+    return Tuned(names, BoostingSettings(rate=0.1), (rounds,) * 3)
 
 
 def test_out_of_fold_errors_are_those_of_rows_that_nothing_was_trained_on() -> None:
@@ -70,7 +70,7 @@ def test_out_of_fold_errors_are_not_flattered_by_the_choice_of_rounds() -> None:
     shares = []
     for seed in range(40):
         rows, target = seen(40, seed), np.random.default_rng(1000 + seed).normal(size=(40, 3))
-        estimate, _ = validated(rows, target, settings=Settings())
+        estimate, _ = validated(rows, target, settings=BoostingSettings())
         shares.append(rms(target - estimate) / rms(target))
     assert np.mean(shares) > 1.003  # 0.997 where a fold's own rows choose
 
@@ -85,7 +85,7 @@ def test_neither_the_number_of_workers_nor_a_second_run_changes_a_tree() -> None
 
 
 def test_settings_are_kept_where_they_are_given() -> None:
-    rows, settings = seen(150, 4), Settings(rate=0.1, leaves=4)
+    rows, settings = seen(150, 4), BoostingSettings(rate=0.1, leaves=4)
     _, tuned = validated(rows, truth(rows), settings=settings)
     assert tuned.settings == settings
 
@@ -96,7 +96,7 @@ def test_sums_get_small_trees_and_products_large_ones() -> None:
         target = component(rows)[:, None] + np.random.default_rng(5).normal(0.0, noise, (n, 3))
         return validated(rows, target)[1].settings.leaves
 
-    assert leaves(600, lambda rows: rows.geometry[:, :3].sum(axis=1), 1.0) < Settings().leaves
+    assert leaves(600, lambda rows: rows.geometry[:, :3].sum(axis=1), 1.0) < BoostingSettings().leaves
     assert leaves(300, lambda rows: np.sign(rows.geometry[:, :3].prod(axis=1) * rows.signals[:, 0]), 0.05) > 15
 
 
@@ -109,14 +109,14 @@ def test_the_work_is_counted_and_stays_within_its_budget(monkeypatch: pytest.Mon
     scarce = validated(rows, target)[1]
     assert plenty.settings.rate == pytest.approx(0.05)
     assert scarce.settings.rate == pytest.approx(0.1)
-    assert scarce.settings.leaves == Settings().leaves
+    assert scarce.settings.leaves == BoostingSettings().leaves
     assert sum(scarce.rounds) < sum(plenty.rounds)
 
 
 def test_trees_leave_the_origins_of_frames_out_unless_they_are_named() -> None:
     rows = seen(150, 9)
-    assert validated(rows, truth(rows), settings=Settings())[1].names == (*NAMES[:3], "a_dir")
-    tuned = validated(rows, truth(rows), settings=Settings(), names=rows.names)[1]
+    assert validated(rows, truth(rows), settings=BoostingSettings())[1].names == (*NAMES[:3], "a_dir")
+    tuned = validated(rows, truth(rows), settings=BoostingSettings(), names=rows.names)[1]
     trees = fitted(rows, truth(rows), tuned)
     assert trees.names == rows.names
     assert trees.fits(rows)
@@ -185,9 +185,9 @@ def test_trees_are_read_and_used_without_lightgbm() -> None:
 def test_a_damaged_text_is_a_value_error(damage: bytes) -> None:
     rows = seen(100, 14)
     files = fitted(rows, truth(rows), few(2)).to_files()
-    with pytest.raises(ValueError, match=r"tree|begin"):
+    with pytest.raises(ValueError, match=r"tree|start"):
         Boosting.from_files(files | {"lightgbm_x.txt": damage})
-    with pytest.raises(ValueError, match="another number of features"):
+    with pytest.raises(ValueError, match="number of features of the trees differs"):
         Boosting.from_files(files | {"lightgbm.json": b'{"features": ["a_deg"]}'})
 
 

@@ -120,7 +120,7 @@ def test_trees_of_another_kind_are_refused_by_name() -> None:
     refused("objective 'poisson'", objective="poisson")
     refused("random forest", boosting="rf", bagging_freq=1, bagging_fraction=0.5)
     refused("linear leaves", linear_tree=True)
-    refused("another number of features", features=COLUMNS + 1)
+    refused("number of features of the trees differs", features=COLUMNS + 1)
     refused("300 leaves|2[5-9][0-9] leaves", num_leaves=300, min_data_in_leaf=1, min_data_in_bin=1, objective="l2")
 
 
@@ -160,7 +160,7 @@ def test_a_text_that_ends_anywhere_before_its_end_is_refused() -> None:
     whole = "\n".join(LINES).encode()
     assert len(read_trees(whole, COLUMNS)) == 2
     for length in range(0, len(whole), 11):
-        with pytest.raises(ValueError, match=r"tree|begin"):
+        with pytest.raises(ValueError, match=r"tree|start"):
             read_trees(whole[:length], COLUMNS)
 
 
