@@ -1,4 +1,4 @@
-"""Commands of operators, as the rooms that carry them out see them: caller, checked arguments, refusals."""
+"""What the parts that carry out operators' commands need: the caller, checked arguments, errors."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import Any
 FAILED, WRONG_USE, REFUSED = 1, 2, 3
 CHECK = "check"
 SESSION_KINDS = ("single_joint", "multi_joint", "static_poses", CHECK)
-HOW_TO_END = "stop or abort it first: `rigcal session stop`, or `rigcal session abort` where it is of no use"
+HOW_TO_END = "stop or abort it first: `rigcal session stop`, or `rigcal session abort` if it is unusable"
 MAX_TEXT_CHARACTERS = 500
 MAX_ENTRIES = 100
 
@@ -26,7 +26,7 @@ class CommandError(Exception):
     """A command that was not carried out.
 
     Attributes:
-        status: 1 failed, 2 wrong use or bad input, 3 refused because the result would be unsafe.
+        status: exit status: 1 failed, 2 wrong use or bad input, 3 refused because the result would be unsafe.
     """
 
     def __init__(self, message: str, status: int = WRONG_USE) -> None:
@@ -34,12 +34,12 @@ class CommandError(Exception):
         self.status = status
 
 
-INSTALLED_CONFIG = Path("/etc/rigcal/rigcal.toml")  # of the service
+INSTALLED_CONFIG = Path("/etc/rigcal/rigcal.toml")  # configuration of the service
 INSTALLED_SOCKET = Path("/run/rigcal/control.sock")
 
 
 def reading_socket(control_path: Path) -> Path:
-    """Return the socket beside the control socket that takes only commands that read."""
+    """Return the path of the read-only control socket, in the directory of the control socket."""
     return control_path.with_name("status.sock")
 
 
@@ -51,9 +51,9 @@ class Caller:
     """The process at the other end of a control connection.
 
     Attributes:
-        user: login name of `uid`; "" where the computer knows none.
-        uid: user id, when it connected.
-        pid: process id, when it connected.
+        user: login name of `uid`; "" if `uid` has none.
+        uid: user id at the time of connecting.
+        pid: process id at the time of connecting.
     """
 
     user: str
@@ -69,31 +69,36 @@ _has_left: ContextVar[Callable[[], bool]] = ContextVar("has_left", default=lambd
 
 
 def current_caller() -> Caller | None:
-    """Return the caller of the command that this thread carries out; None where there is none, as in a replay."""
+    """Return the caller of the command that this thread carries out; None if there is none, as in a replay."""
     return _current.get()
 
 
 def caller_columns(prefix: str = "") -> dict[str, str | int | None]:
-    """Return the columns `<prefix>caller_user`, `..._uid` and `..._pid` of a row that a command makes or changes."""
+    """Return the columns `<prefix>caller_user`, `..._uid` and `..._pid` for a row that a command adds or changes."""
     caller = current_caller()
     user, uid, pid = (None, None, None) if caller is None else (caller.user, caller.uid, caller.pid)
     return {f"{prefix}caller_user": user, f"{prefix}caller_uid": uid, f"{prefix}caller_pid": pid}
 
 
 def caller_has_left() -> bool:
-    """Return True if nobody waits any more for the command that this thread carries out (Ctrl-C, a lost terminal)."""
+    """Return True if the caller of this thread's command has disconnected (Ctrl-C, a closed terminal)."""
     return _has_left.get()()
 
 
 def go_on_for_caller() -> None:
-    """Raise CommandError if nobody waits any more for the command that this thread carries out."""
+    """Raise CommandError if the caller of this thread's command has disconnected."""
     if caller_has_left():
-        raise CommandError("given up, as nobody waits for it any more; what was done until then stays", FAILED)
+        raise CommandError("cancelled, because its caller has disconnected; work done so far is kept", FAILED)
 
 
 @contextlib.contextmanager
 def acting_for(caller: Caller | None, has_left: Callable[[], bool] = lambda: False) -> Iterator[None]:
-    """Make `caller` the current one of this thread, None for nobody; `has_left` tells when it waits no longer."""
+    """Set the current caller of this thread.
+
+    Args:
+        caller: the caller; None for nobody.
+        has_left: returns True once the caller has disconnected.
+    """
     token, left_token = _current.set(caller), _has_left.set(has_left)
     try:
         yield
@@ -106,7 +111,14 @@ def acting_for(caller: Caller | None, has_left: Callable[[], bool] = lambda: Fal
 
 
 def identifier(arguments: Mapping[str, Any], key: str, what: str, default: str = "") -> str:
-    """Return the name that `arguments` gives under `key`; CommandError if it is none."""
+    """Return the name under `key`; CommandError if it is not a valid name.
+
+    Args:
+        arguments: of the command.
+        key: of the argument.
+        what: the argument in words, for the error message.
+        default: used if the argument is missing or empty.
+    """
     name = arguments.get(key)
     if name is None or name == "":
         name = default
@@ -116,7 +128,7 @@ def identifier(arguments: Mapping[str, Any], key: str, what: str, default: str =
 
 
 def text_argument(arguments: Mapping[str, Any], key: str) -> str:
-    """Return the short text that `arguments` gives under `key`, "" by default; CommandError if it is none."""
+    """Return the short text under `key`, "" if missing; CommandError if it is not a short printable text."""
     value = arguments.get(key, "")
     if not isinstance(value, str) or len(value) > MAX_TEXT_CHARACTERS or not value.isprintable():
         raise CommandError(
@@ -126,7 +138,7 @@ def text_argument(arguments: Mapping[str, Any], key: str) -> str:
 
 
 def mapping_argument(arguments: Mapping[str, Any], key: str) -> dict[str, Any]:
-    """Return the object that `arguments` gives under `key`, empty by default; CommandError if it is none."""
+    """Return the object under `key`, empty if missing; CommandError if it is not an object or too large."""
     value = arguments.get(key, {})
     if not isinstance(value, dict) or len(value) > MAX_ENTRIES:
         raise CommandError(f"{key} must be an object of at most {MAX_ENTRIES} entries, not {value!r:.80}")
@@ -134,7 +146,7 @@ def mapping_argument(arguments: Mapping[str, Any], key: str) -> dict[str, Any]:
 
 
 def number_argument(arguments: Mapping[str, Any], key: str, limit: float = 1e6) -> float | None:
-    """Return the number that `arguments` gives under `key`, None by default; CommandError if it is none."""
+    """Return the number under `key`, None if missing; CommandError if it is not finite or above `limit`."""
     value = arguments.get(key)
     is_number = isinstance(value, int | float) and not isinstance(value, bool)
     if value is not None and not (is_number and abs(value) <= limit):

@@ -1,6 +1,6 @@
-"""The composition root: a configuration and a rig become links, decoders and clock.
+"""The composition root: builds links, decoders and clock from a configuration and a rig.
 
-One function for each way to run: live, simulated, replayed. Nothing else in `daemon` knows which it is.
+There is one function for each mode: live, simulated, replayed. No other module of `daemon` depends on the mode.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ from simulators.plan import plan_rows, stops_of
 from simulators.replay import ReplayLink
 
 SIMULATED_SYNC_MS = 200
-_SIMULATED_RIG = "simulated-rig.toml"  # where joints of the configured one are read from nowhere
+_SIMULATED_RIG = "simulated-rig.toml"  # used if the configured rig has joints without a channel
 
 Mode = Literal["live", "simulated", "replayed"]
 _SIMULATED_BOOT = "simulated-"
@@ -58,21 +58,22 @@ class Parts:
     """The parts that the daemon runs.
 
     Attributes:
-        mode: for `status`.
-        rig, rig_text: the machine, and the file that describes it, both with the decoding of channels that DBC and EDS
-            files describe.
-        clock: of everything.
+        mode: live, simulated or replayed, as shown in `status`.
+        rig, rig_text: the machine and the text of its rig file, both including the decoding that DBC and EDS files
+            define.
+        clock: the clock that all parts use.
         links: loops that capture.
-        decoders: link name -> a factory of decoders for its captures.
-        joiner: joins fixes with joints.
-        aim: turns the station to a target, where something can.
-        can_links: those that can be asked for active set-up.
-        visit: drives the boom to the rows of a pose plan, and tells how many stops are to come; None where only an
-            operator does.
-        turn: turns the simulated station as an operator's hand would; None where it turns by itself, or is real.
-        is_over: True when a replay has ended.
-        rig_name: shipped name, or path of the file that describes the machine.
-        has_simulation_ended: True when the process of a simulated rig has ended.
+        decoders: link name -> factory of decoders for its captures.
+        joiner: joins fixes with joint readings.
+        aim: turns the station to a target; None if only an operator can.
+        can_links: CAN links whose devices can be set up.
+        visit: drives the boom to the rows of a pose plan and returns the number of remaining stops; None if only an
+            operator drives it.
+        turn: turns the simulated station in place of an operator's hand; None if the station is real or turns by
+            itself.
+        is_over: returns True once a replay has ended.
+        rig_name: name of a shipped rig, or path of the rig file.
+        has_simulation_ended: returns True once the process of a simulated rig has ended.
     """
 
     mode: Mode
@@ -99,33 +100,33 @@ def live(
     Args:
         config: names the links.
         source: the rig.
-        clock: the host's by default; another one for a rig that somebody simulates at the configured ports.
-        aim: turns the station where something else than the operator can.
+        clock: the host's clock by default; a different one for a rig that is simulated at the configured ports.
+        aim: turns the station to a target; None if only the operator can.
     """
     return _parts("live", config, source, clock or SystemClock(), aim=aim)
 
 
 def require_apart(boots: Sequence[str], store: Path, *, is_simulated: bool) -> None:
-    """Refuse to put a machine's records and those of a simulated one into one store: models would be made of both.
+    """Refuse to mix records of a real and a simulated machine in one store: models would be made of both.
 
     Args:
-        boots: those that the store knows.
-        store: its path.
-        is_simulated: whether a simulated rig is to be run on it.
+        boots: boot ids in the store.
+        store: path of the store.
+        is_simulated: whether a simulated rig is about to run on the store.
 
     Raises:
-        CommandError: it holds records of the other kind.
+        CommandError: the store holds records of the other kind.
     """
     if is_simulated and any(_KERNEL_BOOT.fullmatch(boot) for boot in boots):
         raise CommandError(
-            f"{store} holds records of a real machine, which a simulated one must not be mixed with: give --config a "
-            "file with another state_directory, or none",
+            f"{store} holds records of a real machine, which must not be mixed with simulated ones; give --config a "
+            "file with a different state_directory, or omit it",
             REFUSED,
         )
     if not is_simulated and any(boot.startswith(_SIMULATED_BOOT) for boot in boots):
         raise CommandError(
-            f"{store} holds records of a simulated rig, which a real machine's must not be mixed with: move "
-            f"{store.parent} away, or set another state_directory",
+            f"{store} holds records of a simulated rig, which must not be mixed with a real machine's; move "
+            f"{store.parent} away, or set a different state_directory",
             REFUSED,
         )
 
@@ -142,17 +143,17 @@ def simulated(
     dwell_s: float,
     is_by_hand: bool = False,
 ) -> Iterator[Parts]:
-    """Compose a simulated rig behind real protocols, in a process of its own, on the configured links' names.
+    """Compose a simulated rig that runs in its own process and uses real protocols, under the configured link names.
 
     Args:
         config: names the links.
         source: the rig.
         rate: simulated seconds per second.
-        seed: which machine, which noise, which poses.
-        effects: hidden effects, as the simulator spells them.
-        secret: directory in which the simulator names one more, which it draws; none by default.
-        dwell_s: how long the boom stands at each pose, simulated seconds.
-        is_by_hand: boom and station move only as they are told, as by an operator's hands.
+        seed: determines the machine, the noise and the poses.
+        effects: hidden effects, in the simulator's spelling.
+        secret: directory in which the simulator records one further effect that it draws; None for no such effect.
+        dwell_s: how long the boom stands still at each pose, in simulated seconds.
+        is_by_hand: boom and station move only on command, in place of an operator's hands.
     """
     source, config = _with_devices(source, config)
     now = SystemClock().now()
@@ -200,7 +201,7 @@ def simulated(
 
 
 def _with_devices(source: RigSource, config: Config) -> tuple[RigSource, Config]:
-    """Give every joint that the rig file reads from nowhere a simulated device, in a rig file of the simulation."""
+    """Add a simulated device for every joint without a channel, in a rig file written for the simulation."""
     text = with_simulated_channels(source.rig, source.text)
     if text == source.text:
         return source, config
@@ -212,10 +213,19 @@ def _with_devices(source: RigSource, config: Config) -> tuple[RigSource, Config]
 def simulated_campaign(
     rig: Rig, poses: int, seed: int, *, plan: Path | None, effects: str, noise_mm: float | None, recording: int
 ) -> Campaign:
-    """Simulate a measuring campaign; arguments as for `simulators.campaign.simulate_campaign`, the plan as a file.
+    """Simulate a measuring campaign.
+
+    Args:
+        rig: the nominal machine.
+        poses: number of poses.
+        seed: determines the machine, the noise and random poses.
+        plan: file with a pose plan; None for random poses.
+        effects: hidden effects, in the simulator's spelling, separated by commas.
+        noise_mm: standard deviation of each coordinate of a fix; None for that of the rig file's station.
+        recording: number of the recording; a different number measures the same machine in different poses.
 
     Raises:
-        ConfigError: effects that there are not or that the rig has no place for; a file that is no plan of the rig.
+        ConfigError: an effect is unknown or has no place on the rig, or the file is not a plan for the rig.
     """
     try:
         rows = [] if plan is None else plan_rows(plan, rig)
@@ -239,10 +249,16 @@ def _visit(simulation: SimulatedRig, rig: Rig, dwell_s: float, rows: Sequence[Ma
 
 
 def replayed(config: Config, source: RigSource, files: Sequence[Path], speed: float) -> Parts:
-    """Compose captured logs in place of a rig, at `speed` times the recorded one.
+    """Compose captured logs in place of a rig.
+
+    Args:
+        config: names the links.
+        source: the rig.
+        files: captured logs.
+        speed: recorded seconds per real second.
 
     Raises:
-        DescriptionError, ConfigError: a file is malformed, empty, or of a link that is not configured.
+        DescriptionError, ConfigError: a file is malformed, empty, or belongs to a link that is not configured.
     """
     starts = first_captures(files, config)
     first = min((capture.stamp for capture in starts.values()), key=lambda stamp: stamp.monotonic_ns)
@@ -256,12 +272,12 @@ def replayed(config: Config, source: RigSource, files: Sequence[Path], speed: fl
 
 
 def decoders(config: Config, source: RigSource, files: ChannelFiles | None = None) -> dict[str, Callable[[], Decoder]]:
-    """Return link name -> a factory of decoders for its captures.
+    """Return link name -> factory of decoders for its captures.
 
     Args:
         config: names the links.
         source: the rig.
-        files: its DBC and EDS files, where they were read already.
+        files: the rig's DBC and EDS files if they were read already.
 
     Raises:
         ConfigError: a channel's link is not configured.
@@ -281,14 +297,14 @@ def decoders(config: Config, source: RigSource, files: ChannelFiles | None = Non
     missing = sorted({c.link for c in source.rig.channels} - set(made))
     if missing:
         raise ConfigError(
-            f"rig {source.rig.name!r} has channels on link {missing[0]!r}, which the configuration does not have; add "
+            f"rig {source.rig.name!r} has channels on link {missing[0]!r}, which is not configured; add "
             f'[[can]] name = "{missing[0]}"'
         )
     return made
 
 
 def joiner(config: Config, rig: Rig) -> ObservationJoiner:
-    """Return the joiner of the configured stations' fixes with the rig's joints and signals."""
+    """Return a joiner of the configured stations' fixes with readings of the rig's joints and signals."""
     return ObservationJoiner(
         joint_inputs(rig),
         signal_inputs(rig),
@@ -298,18 +314,18 @@ def joiner(config: Config, rig: Rig) -> ObservationJoiner:
 
 
 def motion_limits(config: Config) -> dict[str, MotionLimit]:
-    """Return, for each configured station, the limit of its prism's motion."""
+    """Return station name -> limit of its prism's motion."""
     return {station.name: MotionLimit.of_station(station) for station in config.station}
 
 
 def _check_identifiers(link: str, own: Sequence[int], factories: Sequence[Callable[[], ChannelDecoder]]) -> None:
-    """Refuse own messages under an identifier that a device of the rig sends."""
+    """Raise ConfigError if rigcal would send under a CAN identifier that a device of the rig uses."""
     for factory in factories:
         channel = factory()
         if channel.arbitration_id in own and not channel.is_extended:
             raise ConfigError(
-                f"tip.can.arbitration_id: {channel.arbitration_id:03X}h is what channel {channel.name!r} is read from "
-                f"on link {link!r}; choose another"
+                f"tip.can.arbitration_id: {channel.arbitration_id:03X}h is in use by channel {channel.name!r} on link "
+                f"{link!r}; choose a different identifier"
             )
 
 

@@ -1,4 +1,4 @@
-"""Commands of the control socket: each name with the part that carries it out, and the sockets that take them."""
+"""Commands of the control socket: maps each name to the part that carries it out, and creates the sockets."""
 
 from __future__ import annotations
 
@@ -29,18 +29,25 @@ from daemon.store.store import Store
 from daemon.store.upkeep.housekeeping import Housekeeping
 from drivers.errors import DeviceError, TransmitForbiddenError
 
-GUARDED = ("setup.new", "session.start", "session.stop", "session.abort", "session.shoot")  # a guide does them itself
+GUARDED = (
+    "setup.new",
+    "session.start",
+    "session.stop",
+    "session.abort",
+    "session.shoot",
+)  # refused while a guide is open
 
 
 @dataclass(frozen=True)
 class Commands:
-    """Every command of a running daemon.
+    """All commands of a running daemon.
 
     Attributes:
-        parts: links, decoders and hands of the rig.
+        parts: links, decoders and actuators of the rig.
         store: open for writing.
-        store_health: tells of the store.
-        housekeeping, setups, sessions, jobs, models, tip, alarms, notices, guide, overview: carry the commands out.
+        store_health: returns the state of the store.
+        housekeeping, setups, sessions, jobs, models, tip, alarms, notices, guide, overview: parts that carry out the
+            commands.
     """
 
     parts: Parts
@@ -58,7 +65,7 @@ class Commands:
     overview: Overview
 
     def handlers(self) -> Mapping[str, Handler]:
-        """Return every command's name and what carries it out."""
+        """Return command name -> its handler."""
         sessions, jobs, models = self.sessions, self.jobs, self.models
         commands: dict[str, Handler] = {
             "status": self.overview.command,
@@ -107,18 +114,18 @@ class Commands:
             return handler(given)
 
     def _if_kept(self, what: str, handler: Handler) -> Handler:
-        """Return a command that is refused where its store would be lost when the daemon stops."""
+        """Wrap a handler: refuse its command if the open store's file is missing or replaced."""
 
         def kept(arguments: Mapping[str, Any]) -> Any:
             health = self.store_health()
             if health.state in ("missing", "replaced"):
-                raise CommandError(f"no {what} is started: {health.text}", REFUSED)
+                raise CommandError(f"the {what} is not started: {health.text}", REFUSED)
             return handler(arguments)
 
         return kept
 
     def _show_rig(self, _arguments: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the rig's name and the text of the file that describes it."""
+        """Return the rig's name and the text of its rig file."""
         return {"rig": self.parts.rig.name, "text": self.parts.rig_text}
 
     def _turn(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
@@ -130,34 +137,34 @@ class Commands:
         return {"target": target}
 
     def _visit(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
-        """Send the simulated boom to the rows of a pose plan; `left` tells how many stops are to come."""
+        """Send the simulated boom to the rows of a pose plan; `left` is the number of remaining stops."""
         rows = arguments.get("poses", [])
         if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
-            raise CommandError("poses: the rows of a plan, as `rigcal plan --json` prints them")
+            raise CommandError("poses: must be rows of a plan, as printed by `rigcal plan --json`")
         if self.parts.visit is None:
             raise _not_by_hand("boom")
         return {"left": self.parts.visit(rows)}
 
     def _prune(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
-        """Delete captures and readings outside sessions that are older than so many days."""
+        """Delete captures and readings outside sessions that are older than a number of days."""
         return self.housekeeping.prune_command(arguments, go_on_for_caller)
 
     def _redecode(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
-        """Make all readings and fixes of a session, or of some time, again from raw captures."""
+        """Decode the raw captures of a session or of a time span again into readings and fixes."""
         return redecode_command(self.store, self.parts.rig, self.parts.decoders, arguments, go_on_for_caller)
 
     def _configure_devices(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
-        """Set up CANopen devices, if the operator says that the machine is parked."""
+        """Set up CANopen devices, if the operator confirms that the machine is parked."""
         if arguments.get("machine_is_parked") is not True:
             raise CommandError(
-                "say that the machine is parked and locked out (--machine-is-parked): set-up writes to devices"
+                "set-up writes to devices; confirm with --machine-is-parked that the machine is parked and locked out"
             )
         links = [link for link in self.parts.can_links if link.has_setups]
         if not links:
             raise CommandError("no CAN link of this rig has CANopen nodes to set up")
         try:
             for link in links:
-                link.check_setup()  # all before any: nothing is half done
+                link.check_setup()  # check all before any is set up, so that nothing is left half done
             for link in links:
                 link.request_setup()
         except TransmitForbiddenError as error:
@@ -167,18 +174,22 @@ class Commands:
         names = ", ".join(link.name for link in links)
         return {
             "links": names,
-            "text": f"the nodes on {names} are being set up; `rigcal status` shows what comes of it",
+            "text": f"the nodes on {names} are being set up; `rigcal status` shows the result",
         }
 
 
 def control_servers(config: Config, commands: Mapping[str, Handler]) -> tuple[list[ControlServer], dict[str, str]]:
-    """Start the control socket, and the one for those who may only look where a group of them is configured.
+    """Start the control socket, and the read-only socket if a `read_group` is configured.
+
+    Args:
+        config: of the daemon.
+        commands: command name -> its handler.
 
     Returns:
-        The servers, and the name of a socket that could not be made -> why.
+        The servers, and socket name -> reason for a socket that could not be created.
 
     Raises:
-        CommandError: the control socket cannot be made.
+        CommandError: the control socket cannot be created.
     """
     servers, unserved = [ControlServer(config.socket_path, commands)], {}
     if config.read_group is not None:
@@ -186,10 +197,10 @@ def control_servers(config: Config, commands: Mapping[str, Handler]) -> tuple[li
         try:
             servers.append(ControlServer(path, reading_only(commands, config.socket_path), group=config.read_group))
         except CommandError as error:
-            unserved[path.name] = f"members of read_group {config.read_group} cannot look: {error}"
+            unserved[path.name] = f"members of read_group {config.read_group} cannot connect: {error}"
     return servers, unserved
 
 
 def _not_by_hand(what: str) -> CommandError:
-    by_hand = "only a simulated rig that was started with `rigcal run --sim --by-hand` is moved by hand"
-    return CommandError(f"the {what} is not moved from here: {by_hand}", REFUSED)
+    by_hand = "only a simulated rig started with `rigcal run --sim --by-hand` can"
+    return CommandError(f"the {what} cannot be moved by command: {by_hand}", REFUSED)

@@ -1,6 +1,6 @@
 """The next step: what the rig is doing and what to do now, in words for the page and for the terminal.
 
-Both are told of the daemon's status, whose `guide` has the step of a guide that is open.
+Both are derived from the daemon's status, whose `guide` holds the current step of an open guide.
 """
 
 from __future__ import annotations
@@ -16,30 +16,30 @@ Tone = Literal["good", "busy", "wait", "warning", "critical"]
 
 _JOBS: Mapping[str, str] = {
     "gap": "identifying the model",
-    "residual": "learning what remains",
+    "residual": "training the residual model",
     "report": "writing the report",
     "comparison": "comparing models",
-    "drift": "holding check shots against the live model",
+    "drift": "comparing check shots with the live model",
 }
-_ENOUGH_POSES = {CHECK: 5}  # of one session, by its kind
+_ENOUGH_POSES = {CHECK: 5}  # session kind -> poses that suffice for one session
 _ENOUGH_USUALLY = 25
 _NEW_SESSION = "`rigcal session guide --prisms NAMES`, or `rigcal session start --prism NAME`"
 
 
 @dataclass(frozen=True)
 class NextStep:
-    """A state with the step that follows from it.
+    """The current state and the step that follows from it.
 
     Attributes:
         state: what is going on, in a few words.
-        tone: how urgent the page makes it look.
+        tone: urgency, which sets the colour on the page.
         step: what to do next, a sentence without its full stop.
-        how: commands of the terminal that do it; "" where it needs none.
-        button: the page's; None where nothing is to be pressed.
-        command: what the button sends to the daemon; None where it opens a screen.
+        how: terminal commands that do it; "" if none is needed.
+        button: label of the page's button; None for no button.
+        command: command that the button sends to the daemon; None if it opens a screen.
         arguments: of the command.
-        screen: what the button opens; None where it sends a command.
-        is_pressing: an alarm that is not critical does not come before it.
+        screen: screen that the button opens; None if it sends a command.
+        is_pressing: whether the step is shown in preference to alarms that are not critical.
     """
 
     state: str
@@ -54,7 +54,7 @@ class NextStep:
 
 
 def next_for_page(status: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the next step as the page shows it large; it lists the alarms itself, and takes their colour."""
+    """Return the next step for the page's headline, coloured as critical if a critical alarm is active."""
     found = _next_step(status)
     is_critical = any(alarm["severity"] == "critical" for alarm in status["alarms"]["active"])
     return {
@@ -69,7 +69,7 @@ def next_for_page(status: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def next_line(status: Mapping[str, Any]) -> str:
-    """Return the next step in one line of the terminal: the remedy of an alarm, or what to do with its command."""
+    """Return the next step as one terminal line: the remedy of an alarm, or the step and its command."""
     found, alarms = _next_step(status), status["alarms"]["active"]
     critical = [alarm for alarm in alarms if alarm["severity"] == "critical"]
     for alarm in critical or ([] if found.is_pressing else alarms):
@@ -78,7 +78,7 @@ def next_line(status: Mapping[str, Any]) -> str:
 
 
 def _next_step(status: Mapping[str, Any]) -> NextStep:
-    guide = status.get("guide")  # a daemon of 0.1, which may run on after an upgrade, tells neither it nor `setup`
+    guide = status.get("guide")  # rigcal 0.1, which may still run after an upgrade, sends neither this nor `setup`
     if guide is not None:
         return _of_guide(guide["step"])
     if status["session"] is not None:
@@ -93,7 +93,7 @@ def _of_guide(step: Mapping[str, Any]) -> NextStep:
     does, how = f"{does[:1].lower()}{does[1:]}", "`rigcal session guide`"
     if step["is_busy"] or step["button"] is None:
         return NextStep(step["title"], "wait" if step["is_busy"] else "busy", does, how, screen="guide")
-    if step["is_detected"]:  # it ends by itself: what counts is where to go, which the guide's screen shows
+    if step["is_detected"]:  # it ends by itself; the guide's screen shows where to go
         return NextStep(step["title"], "busy", does, how, "Open the guide", screen="guide")
     return NextStep(step["title"], "busy", does, how, step["button"], "guide.done", {"step": step["id"]})
 
@@ -105,7 +105,7 @@ def _in_session(session: Mapping[str, Any]) -> NextStep:
 
 
 def _of_session(session: Mapping[str, Any]) -> tuple[str, str]:
-    """Return what to do in a session, and with which command."""
+    """Return what to do in an open session, and the command for it."""
     points = {
         phase: {s["point"] for s in session["control_shots"] if s["phase"] == phase} for phase in ("start", "end")
     }
@@ -114,7 +114,7 @@ def _of_session(session: Mapping[str, Any]) -> tuple[str, str]:
         return str(suspicions[0]["remedy"]), ""
     if session["setup_moved"]:
         how = "`rigcal session stop`, then `rigcal setup new`"
-        return "the station has moved: stop the session, then describe where it stands", how
+        return "the station has moved: stop the session, then record the station's new set-up", how
     if not points["start"] and not points["end"]:
         return "aim the station at a control point and shoot it", "`rigcal session shoot NAME`"
     if session["poses"] < enough:
@@ -122,7 +122,7 @@ def _of_session(session: Mapping[str, Any]) -> tuple[str, str]:
         return f"stand still at {more} more pose{'s' if more > 1 else ''}, spread over the ranges of all joints", ""
     if missing := sorted(points["start"] - points["end"]):
         return "enough poses: shoot the control points again", f"`rigcal session shoot {missing[0]}`"
-    step = "enough poses: stop the session; identification, effects, residual and report follow by themselves"
+    step = "enough poses: stop the session; identification, effects, residual and report then run automatically"
     return step, "`rigcal session stop`"
 
 
@@ -141,7 +141,7 @@ def _between_sessions(status: Mapping[str, Any]) -> NextStep:
     if candidate is not None and candidate["is_acceptable"]:
         what = f"Model {candidate['id']} is better and waits for you"
         how = f"`rigcal model show {candidate['id']}`, `rigcal model accept {candidate['id']}`"
-        step = "look at what it changes, then accept it"
+        step = "review its changes, then accept it"
         return NextStep(what, "good", step, how, "Review the model", screen="models")
     is_drifting = drift is not None and drift["alarm"] == "worse"
     tone: Tone = "warning"
@@ -150,7 +150,7 @@ def _between_sessions(status: Mapping[str, Any]) -> NextStep:
     elif live is None:
         what = "No model is live yet"
     elif is_drifting:
-        what = f"Model {live['id']} is live, and check shots drift from it"
+        what = f"Model {live['id']} is live, but check shots show drift from it"
     else:
         what, tone = f"Ready: model {live['id']} is live", "good"
     pressing = next(_pressing(status, candidate), None)
@@ -160,33 +160,33 @@ def _between_sessions(status: Mapping[str, Any]) -> NextStep:
 
 
 def _pressing(status: Mapping[str, Any], candidate: Mapping[str, Any] | None) -> Iterator[tuple[str, str]]:
-    """Yield what keeps the next model from being made or judged, the most important first."""
+    """Yield steps without which the next model cannot be made or judged, the most important first."""
     setup, gap = status.get("setup"), status["gap"] or {}
     if setup is None:
-        yield "describe where the station stands, and be led", "`rigcal session guide --new-setup NAME`"
+        yield "record the station's set-up in a guided session", "`rigcal session guide --new-setup NAME`"
     elif setup["state"] != "ok":
-        yield "describe where the station stands", "`rigcal setup new NAME --instrument TYPE`"
+        yield "record the station's set-up", "`rigcal setup new NAME --instrument TYPE`"
     if gap.get("failed") is not None:
         how = "`rigcal jobs list`, `rigcal session start`"
-        yield f"job {gap['failed']['job']} failed: do what it says, or hold another session", how
+        yield f"job {gap['failed']['job']} failed: follow its error message, or hold another session", how
     if candidate is not None and candidate["comparison"] is None:
         how = "`rigcal session start --kind check --prism NAME`"
-        yield "hold a check session, to compare the new model with", how
+        yield "hold a check session to judge the new model", how
     verdict = gap.get("verdict")
     if verdict is not None and verdict["verdict"] == "indistinguishable" and verdict["experiments"]:
-        yield f"measure what tells the causes apart: {verdict['experiments'][0]}", ""
+        yield f"measure what distinguishes the possible causes: {verdict['experiments'][0]}", ""
 
 
 def _to_improve(
     live: Mapping[str, Any] | None, candidate: Mapping[str, Any] | None, *, is_drifting: bool
 ) -> tuple[str, str]:
-    """Return what makes the first model, or a better one."""
+    """Return the step that leads to a first or a better model, and the command for it."""
     if candidate is not None:
         refused = f"model {candidate['id']} would be refused: {candidate['refused_because']}"
-        return f"{refused}; hold sessions of other prisms or poses, then another check session", ""
+        return f"{refused}; hold sessions with other prisms or poses, then another check session", ""
     if live is None:
-        step = "hold a calibration session; a guided one leads through all prisms and a check to a first model"
+        step = "hold a calibration session; a guided session covers all prisms and a check, and yields a first model"
         return step, f"{_NEW_SESSION}; `rigcal plan` proposes poses"
     if is_drifting:
         return "the machine has changed: measure it again", _NEW_SESSION
-    return "nothing needs doing; a check session now and then shows whether the live model still holds", ""
+    return "nothing to do; an occasional check session shows whether the live model is still accurate", ""

@@ -1,4 +1,4 @@
-"""The daemon's state as one JSON object: what `rigcal status`, `rigcal health` and the metrics are made of."""
+"""The daemon's state as one JSON object, the source of `rigcal status`, `rigcal health` and the metrics."""
 
 from __future__ import annotations
 
@@ -26,24 +26,24 @@ from daemon.version import VERSION
 
 T = TypeVar("T")
 
-_EVENTS = 12  # the newest are shown in `status`
+_EVENTS = 12  # newest events that `status` shows
 
 
 def newest_latency(by_session: Mapping[str, Mapping[str, Any]]) -> dict[str, Any] | None:
-    """Return the latency of the last session that has one, with the session's name."""
+    """Return the newest known latency with the name of its session; None if no session has one."""
     known = [{"session": name, **found} for name, found in by_session.items() if "seconds" in found]
     return known[-1] if known else None
 
 
 @dataclass(frozen=True)
 class Overview:
-    """Gathers the state of all parts; may be asked from any thread.
+    """Gathers the state of all parts; may be used from any thread.
 
     Attributes:
         parts: rig and mode.
         store: open for writing.
-        store_health, acquisition: tell of the store and of acquisition.
-        clock: tells of the computer's clock; None where it is not known, or is another one.
+        store_health, acquisition: return the state of the store and of acquisition.
+        clock: returns the state of the host's clock; None if it is unknown or not in use.
         alarms, notices, sessions, guide, runner, jobs, models, model_table: the parts.
     """
 
@@ -62,7 +62,7 @@ class Overview:
     model_table: ModelTable
 
     def command(self, _arguments: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the state of everything; a part of the store that is damaged hides no other."""
+        """Return the state of all parts; a damaged part of the store does not hide the others."""
         unreadable: dict[str, str] = {}
         clock = self.parts.clock
 

@@ -1,4 +1,4 @@
-"""Rigs as the daemon and the commands name them: a shipped one by its name, any by the path of its file."""
+"""Loads rigs for the daemon and the commands: shipped rigs by name, any rig by the path of its file."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ class RigSource:
 
     Attributes:
         rig: the description.
-        text: the TOML it was read from; travels with the model.
-        directory: where the DBC and EDS files that it names are.
+        text: the TOML text it was read from, which is stored with each model.
+        directory: directory of the DBC and EDS files that the rig file names.
     """
 
     rig: Rig
@@ -32,15 +32,15 @@ class RigSource:
 
 
 def load_rig(name_or_path: str, signals: Sequence[str] = (), *, named_in: Path | None = None) -> RigSource:
-    """Load a shipped rig by its name, or any rig by the path of its file.
+    """Load a shipped rig by name, or any rig by the path of its file.
 
     Args:
-        name_or_path: of the rig.
-        signals: columns of further signals, as `Rig.with_signals` takes them.
-        named_in: the configuration whose key `rig` names it, for messages.
+        name_or_path: name of a shipped rig, or path of a rig file.
+        signals: columns of additional signals, as for `Rig.with_signals`.
+        named_in: configuration file whose key `rig` names the rig, for error messages.
 
     Raises:
-        RigError: no such rig or file, or the file is malformed.
+        RigError: the rig or its file does not exist, or the file is malformed.
     """
     try:
         text, name, directory = read_rig_text(name_or_path)
@@ -55,10 +55,10 @@ def load_rig(name_or_path: str, signals: Sequence[str] = (), *, named_in: Path |
 
 
 def read_rig_text(name_or_path: str) -> tuple[str, str, Path]:
-    """Read a rig's text, unchecked; returns it with the file's name and directory.
+    """Read the text of a rig file without checking it; return the text, the file's name and its directory.
 
     Raises:
-        RigError: no such rig or file, or it cannot be read.
+        RigError: the rig or its file does not exist or cannot be read.
     """
     path = rig_path(name_or_path)
     try:
@@ -69,12 +69,12 @@ def read_rig_text(name_or_path: str) -> tuple[str, str, Path]:
 
 
 def misreading(rig: Rig, recorded_text: str | None, prism: str) -> str:
-    """Return why readings that were made with another rig file are not those of `rig`, a clause; "" where they are.
+    """Return why readings decoded with a different rig file cannot be used with `rig`, as a clause; "" if they can.
 
     Args:
-        rig: what they are to be used with.
-        recorded_text: the rig file that turned counts into the readings; None where the store lacks it.
-        prism: on which they were measured.
+        rig: the rig that the readings are to be used with.
+        recorded_text: rig file with which the readings were decoded; None if the store lacks it.
+        prism: name of the prism that was measured.
     """
     if recorded_text == rig.text:
         return ""
@@ -89,11 +89,11 @@ def misreading(rig: Rig, recorded_text: str | None, prism: str) -> str:
 
 
 def tells_decoding(rig: Rig, recorded_text: str) -> bool:
-    """Return True if a recorded rig file says how each channel of `rig` that a DBC or EDS file describes was read.
+    """Return True if a recorded rig file includes the decoding of each channel that `rig` takes from DBC or EDS files.
 
     Args:
-        rig: what its readings are to be used with.
-        recorded_text: a rig file of which `misreading` says nothing.
+        rig: the rig that the readings are to be used with.
+        recorded_text: a rig file for which `misreading` returned "".
     """
     recorded = _recorded(recorded_text)
     return isinstance(recorded, Rig) and rig.decoding.keys() <= recorded.decoding.keys()
@@ -101,7 +101,7 @@ def tells_decoding(rig: Rig, recorded_text: str) -> bool:
 
 @lru_cache(maxsize=16)
 def _recorded(text: str) -> Rig | str:
-    """Return the rig of a file, or why it is none: it takes some 10 ms, and hundreds of sessions may have the same."""
+    """Return the rig in a text, or the parse error. Cached: parsing takes 10 ms, and many sessions share one text."""
     try:
         return parse_rig(text, "the rig file")
     except RigError as error:

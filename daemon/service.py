@@ -1,4 +1,4 @@
-"""The daemon itself: starts the parts in order, keeps the service manager informed, stops them in order."""
+"""The daemon itself: starts its parts in order, keeps the service manager informed, and stops the parts cleanly."""
 
 from __future__ import annotations
 
@@ -56,21 +56,21 @@ from drivers.readings import Record
 log = logging.getLogger(__name__)
 
 BEAT_S = 1.0
-STOP_S = 20.0  # real seconds for all parts together, well within the unit's TimeoutStopSec
-STORE_END_S = 3.0  # of them for the store's last commits
+STOP_S = 20.0  # real seconds to stop all parts, well within the unit's TimeoutStopSec
+STORE_END_S = 3.0  # part of STOP_S that is reserved for the store's last commits
 
 
 class Daemon:
     """Acquisition, sessions, jobs and the control socket, on one store.
 
     Args:
-        config: as checked.
+        config: the checked configuration.
         store: open for writing; the caller closes it.
-        parts: links, decoders, clock and hands, as composed for a real, a simulated or a replayed rig.
+        parts: links, decoders, clock and actuators, composed for a real, a simulated or a replayed rig.
 
     Raises:
-        StoreError: the store cannot be written to; the message says why and what to do.
-        CommandError: the control socket cannot be made.
+        StoreError: the store cannot be written to; the message gives the reason and the remedy.
+        CommandError: the control socket cannot be created.
     """
 
     def __init__(self, config: Config, store: Store, parts: Parts) -> None:
@@ -80,8 +80,9 @@ class Daemon:
             try:
                 self._compose(config, store, parts)
             except BaseException:
-                if store.ended_in_order:  # else the check for damage, which the run before calls for, is still to come
-                    self._end_run()  # in order: nothing was captured
+                # After an unclean shutdown the store still has to be checked for damage, so the run stays open.
+                if store.ended_in_order:
+                    self._end_run()  # a clean end, as nothing was captured
                 raise
 
     def _compose(self, config: Config, store: Store, parts: Parts) -> None:
@@ -89,7 +90,7 @@ class Daemon:
         declare_channels(store, parts.rig)
         self._watch = StoreWatch(store, parts.clock)
         self._housekeeping = Housekeeping(store, parts.clock, keeping_of(config))
-        # Simulated and replayed rigs have a clock of their own.
+        # Simulated and replayed rigs have their own clocks.
         read_clock = partial(clock_state, os.environ.get(CLOCK_SOCKET) or None)
         self._time = TimeWatch(read_clock, parts.clock) if parts.mode == "live" else None
         self._setups = StationSetups(parts.rig, store, parts.clock, config.sessions.control_tolerance_mm)
@@ -101,7 +102,7 @@ class Daemon:
             parts.joiner,
             config.sessions,
             parts.clock,
-            run_id=store.run_id or parts.clock.now().utc_ns // NS_PER_S,  # unique also where the runs are damaged
+            run_id=store.run_id or parts.clock.now().utc_ns // NS_PER_S,  # unique even if the table of runs is damaged
             aim=parts.aim,
             limits=motion_limits(config),
             are_jobs_enabled=config.jobs.enabled,
@@ -117,10 +118,10 @@ class Daemon:
             self._setups.current,
             parts.clock,
             prism,
-            fresh_s=FRESH_S / parts.clock.real_seconds(1.0),  # what delays readings here are computers, in real time
+            fresh_s=FRESH_S / parts.clock.real_seconds(1.0),  # computers cause the delay, so it is in real time
         )
         self._sender = tip_sender(config, parts, self._tip)
-        before = store.previous_end if parts.mode == "live" else None  # other clocks are none of the computer's
+        before = store.previous_end if parts.mode == "live" else None  # only a live rig uses the host's clock
         self._acquisition = Acquisition(
             parts.links,
             parts.decoders,
@@ -141,9 +142,9 @@ class Daemon:
         )
         self._job_table, self._model_table = JobTable(store, parts.rig.name), models
         self._servers: list[ControlServer] = []
-        self._unserved: dict[str, str] = {}  # sockets that could not be made, and why
+        self._unserved: dict[str, str] = {}  # sockets that could not be created -> reason
         alarms = AlarmTable(store)
-        notify = config.notify if parts.mode != "replayed" else None  # what a log says happened long ago
+        notify = config.notify if parts.mode != "replayed" else None  # events of a replayed log are old
         self._notices = Notices(notify, NoticeTable(store), alarms.active(), parts.rig.name, parts.clock)
         evidence = Gatherer(parts.clock, before, self._evidence())
         self._alarms = AlarmBoard(alarms, evidence, parts.clock, tell=self._notices.take)
@@ -167,7 +168,7 @@ class Daemon:
             model=self._awaiting_model,
             settle_s=config.sessions.settle_s,
             has_aim=parts.aim is not None,
-            drive=parts.visit if parts.aim is not None else None,  # by hand, commands move both
+            drive=parts.visit if parts.aim is not None else None,  # with --by-hand, commands move boom and station
         )
         self._overview = Overview(
             parts,
@@ -204,7 +205,7 @@ class Daemon:
         self._metrics = None if metrics is None else MetricsServer(metrics.port, lambda: self._overview.command({}))
 
     def _evidence(self) -> dict[str, Callable[[], object]]:
-        """Part of the alarms' evidence -> function that tells it."""
+        """Return part of the alarms' evidence -> function that supplies it."""
         sessions = SessionTable(self._store, self._parts.rig.name)
         return {
             "acquisition": self._acquisition.status,
@@ -229,25 +230,25 @@ class Daemon:
         }
 
     def _control_faults(self) -> dict[str, str]:
-        """Return the control sockets that nobody can connect to -> why."""
+        """Return control sockets that nobody can connect to -> reason."""
         found = {server.path.name: server.trouble() for server in self._servers}
         return self._unserved | {name: trouble for name, trouble in found.items() if trouble is not None}
 
     @property
     def store_health(self) -> StoreHealth:
-        """The store's health; from any thread."""
+        """Health of the store; may be read from any thread."""
         return self._watch.health
 
     def _are_jobs_held(self) -> bool:
-        """Return True while the store cannot be trusted or captures wait to be decoded."""
+        """Return True while the store cannot be trusted or captures are waiting to be decoded."""
         return self._watch.health.state != "ok" or self._acquisition.is_behind
 
     def run(self, stop: threading.Event, notifier: Notifier) -> None:
-        """Acquire until `stop` is set or a replay has ended; then stop everything in order.
+        """Acquire until `stop` is set or the replay has ended, then stop all parts cleanly.
 
         Raises:
-            AcquisitionError: nothing is stored any more, and the process should end and be started again; or captures
-                could not be stored before the end.
+            AcquisitionError: nothing is stored any more, so the process should be restarted; or captures could not be
+                stored before the end.
         """
         with self._ended_threads:
             self._run(stop, notifier)
@@ -276,9 +277,9 @@ class Daemon:
                 if self._metrics is not None:
                     self._metrics.look()
                 self._alarms.evaluate()
-                self._sessions.aim_again()  # after the alarm that somebody should
-                # The watchdog hears of the writer and of the control sockets, not of this loop: a hung disk must
-                # restart the service, and so must a daemon that no one can reach.
+                self._sessions.aim_again()  # after the alarm that asks somebody to aim
+                # The watchdog monitors the writer and the control sockets rather than this loop: a hung disk must
+                # restart the service, and so must a control socket that does not answer.
                 within_s = notifier.watchdog_s or 60.0
                 if self._acquisition.alive(within_s) and all(server.alive(within_s) for server in self._servers):
                     notifier.send("WATCHDOG=1")
@@ -291,7 +292,7 @@ class Daemon:
         self._acquisition.check()
 
     def close(self) -> None:
-        """Stop all parts within `STOP_S`, side by side, so that no one's stop delays what was captured."""
+        """Stop all parts within `STOP_S`, in parallel, so that no part delays storing what was captured."""
         budget = TimeBudget(STOP_S)
         stops = [server.close for server in self._servers]
         stops += [
@@ -311,7 +312,7 @@ class Daemon:
         for thread, stop in zip(others, stops, strict=True):
             thread.join(budget.left_s)
             if thread.is_alive():
-                log.error("%s did not end within %g s; it is left behind", _name(stop), STOP_S)
+                log.error("%s did not end within %g s; stopping without it", _name(stop), STOP_S)
         if is_store_free and self._acquisition.has_stored_all and not self._store.damage:
             self._end_run()
         log.info("stopped")
@@ -323,21 +324,21 @@ class Daemon:
             log.error("the end of this run could not be stored: %s", storage_sentence(self._store.path, error))
 
     def _awaiting_model(self) -> dict[str, Any]:
-        """Return the candidate that awaits for a guide that is finished, and how many jobs it still waits for."""
+        """Return, for a finished guide, the pending candidate model and the number of jobs that are still to run."""
         waiting = self._models.status()["candidate"]
         about = dict.fromkeys(("id", "is_acceptable", "refused_because", "sentence"))
         if waiting is not None:
             compared = waiting["comparison"]
             about = {key: waiting[key] for key in ("id", "is_acceptable", "refused_because")}
             about["sentence"] = compared and compared["sentence"]
-        # The jobs of the last session are queued a moment after it has ended.
+        # The jobs of the last session are queued shortly after its end.
         return about | {"jobs": len(self._job_table.unfinished()) or int(self._jobs.awaited_session() is not None)}
 
     def _on_records(self, records: Sequence[Record]) -> None:
         try:
-            self._sessions.on_records(records)  # feeds the joiner, which the tip looks at
+            self._sessions.on_records(records)  # feeds the joiner, which the tip reads
         finally:
-            self._tip.on_records(records)  # also when an observation cannot be stored: an encoder may have jumped
+            self._tip.on_records(records)  # even if an observation cannot be stored: an encoder may have jumped
             self._guide.on_records(records)
 
 
@@ -345,7 +346,7 @@ def _stop_part(stop: Callable[[], None]) -> None:
     try:
         stop()
     except Exception:
-        # Of parts that go away together, one that stumbles must keep no other from ending.
+        # An error while stopping one part must not keep the others from stopping.
         log.exception("%s failed", _name(stop))
 
 
@@ -354,7 +355,7 @@ def _name(stop: Callable[[], None]) -> str:
 
 
 def tip_sender(config: Config, parts: Parts, tip: LiveTip) -> TipSender | None:
-    """Return the sender of the tip; None if none is to be sent, or if there is no bus, as in a replay."""
+    """Return the sender of tip frames; None if none is configured or there is no bus, as in a replay."""
     if config.tip is None or config.tip.can is None:
         return None
     link = next((link for link in parts.can_links if link.name == config.tip.can.link), None)
@@ -362,18 +363,18 @@ def tip_sender(config: Config, parts: Parts, tip: LiveTip) -> TipSender | None:
 
 
 def is_store_new(jobs: JobTable, models: Path) -> bool:
-    """Return True if a store has never seen a job, and yet its models' directory holds some."""
+    """Return True if the store has never had a job although its models directory is not empty."""
     return models.is_dir() and any(models.iterdir()) and jobs.newest_id() == 0
 
 
 def declare_channels(store: Store, rig: Rig) -> None:
-    """Tell the store which channels are the rig's joints and which are signals."""
+    """Declare in the store which channels are the rig's joints and which are signals."""
     joints = {joint.name: joint.unit for joint in rig.joints}
     store.declare_channels(joints, {c.name: c.unit for c in rig.channels if c.name not in joints})
 
 
 def keeping_of(config: Config) -> Keeping:
-    """Return what the store keeps, as configured."""
+    """Return the configured retention of the store."""
     return Keeping(
         keep_days=config.store.keep_days,
         free_bytes=config.store.free_bytes,
@@ -384,7 +385,7 @@ def keeping_of(config: Config) -> Keeping:
 
 
 def stop_on_signals(stop: threading.Event) -> Callable[[], None]:
-    """Set `stop` on SIGTERM and SIGINT; returns what puts the old handlers back."""
+    """Set `stop` on SIGTERM and SIGINT; return a function that restores the previous handlers."""
     before = {s: signal.signal(s, lambda *_: stop.set()) for s in (signal.SIGTERM, signal.SIGINT)}
 
     def restore() -> None:

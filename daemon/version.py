@@ -1,3 +1,3 @@
-"""The version of rigcal, said here and nowhere else: the build, the packages and the public face read it from here."""
+"""The version of rigcal, defined only here: the build, the packages and the public API read it from this module."""
 
 VERSION = "0.4.0"

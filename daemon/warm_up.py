@@ -1,13 +1,13 @@
-"""Compiled kernels: where they are kept, and how to compile them ahead (`python -m daemon.warm_up`).
+"""Caches of compiled kernels: choosing their directory, and compiling ahead of time (`python -m daemon.warm_up`).
 
-numba compiles a function when it is first called; all of rigcal's take some twenty seconds. numba and matplotlib keep
-files between runs, by default beside the installed program or in the home directory. A service can write to neither,
-and a laptop's may be read-only; then numba refuses to compile at all. So `prepare` chooses a writable directory before
-either is imported.
+numba compiles a function at its first call; compiling all of rigcal's kernels takes about twenty seconds. numba and
+matplotlib keep caches between runs, by default next to the installed program or in the home directory. A service cannot
+write to either, and on a laptop they may be read-only; numba then refuses to compile at all. So `prepare` chooses a
+writable directory before either package is imported.
 
-Set-up and installation call `main`, which runs a small calibration by each method with loops of its own, cut short as
-soon as each loop was called. It fits invented fixes and writes nothing but the two caches. A failure is one sentence
-and exit status 0: the first calibration compiles what is missing.
+Set-up and installation call `main`, which runs a small calibration with each method that has its own kernels and stops
+once each kernel was called. It fits synthetic fixes and writes nothing but the two caches. A failure is reported in one
+sentence, with exit status 0: the first calibration compiles what is missing.
 """
 
 from __future__ import annotations
@@ -27,26 +27,26 @@ if TYPE_CHECKING:
     from calibration.rig.description import Rig
     from calibration.run_settings import Run
 
-_RIG = "swdt82"  # with couplings, rows of beta, prismatic joints and several prisms: all that a rig may have
+_RIG = "swdt82"  # has all that a rig may have: couplings, rows of beta, prismatic joints, several prisms
 _POSES = 30
 _CURVES = 100  # columns that are nearly all zero, as splines are
-_JOINT_ERROR_DEG = 0.15  # far beyond noise: a global search is asked for, yet no search for encoders that are reversed
+_JOINT_ERROR_DEG = 0.15  # far above noise: triggers the global search, but not the search for reversed encoders
 
 
 def prepare(environ: MutableMapping[str, str] = os.environ) -> Path:
     """Point NUMBA_CACHE_DIR and MPLCONFIGDIR at writable directories; call before numba or matplotlib is imported.
 
-    A directory the user has set is kept where it can be written. Otherwise the service's CACHE_DIRECTORY (systemd),
-    the user's cache directory and a private temporary directory are tried in this order.
+    A directory that the user has set is kept if it is writable. Otherwise the service's CACHE_DIRECTORY (systemd), the
+    user's cache directory and a private temporary directory are tried in this order.
 
     Args:
         environ: the process's environment, which spawned children inherit.
 
     Returns:
-        The directory of numba's cache.
+        The directory of the numba cache.
 
     Raises:
-        OSError: not even a temporary directory can be made.
+        OSError: not even a temporary directory can be created.
     """
     root: Path | None = None
     for variable, name in (("NUMBA_CACHE_DIR", "numba"), ("MPLCONFIGDIR", "matplotlib")):
@@ -61,7 +61,7 @@ def prepare(environ: MutableMapping[str, str] = os.environ) -> Path:
 
 
 def is_compiled(environ: MutableMapping[str, str] = os.environ) -> bool:
-    """Return True if anything was compiled before into the directory that `prepare` chooses."""
+    """Return True if the cache directory that `prepare` chooses already holds compiled code."""
     return any(prepare(environ).rglob("*.nbi"))
 
 
@@ -75,7 +75,7 @@ def _candidates(environ: MutableMapping[str, str]) -> Iterator[Path]:
 
 
 def _writable(path: Path) -> bool:
-    # Permission bits say nothing of read-only mounts, so a file is made.
+    # Permission bits do not reveal read-only mounts, so create a file.
     try:
         path.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=path):
@@ -85,7 +85,7 @@ def _writable(path: Path) -> bool:
 
 
 def _private_temporary() -> Path:
-    # The caches hold code that is run: a directory that another user could have prepared is not used.
+    # The caches hold code that is executed: do not use a directory that another user could have prepared.
     path = Path(tempfile.gettempdir()) / f"rigcal-{os.getuid()}"
     with contextlib.suppress(FileExistsError):
         path.mkdir(mode=0o700)
@@ -99,13 +99,13 @@ def _private_temporary() -> Path:
 
 
 def place_of_caches(environ: MutableMapping[str, str]) -> str | None:
-    """Choose the directories of the caches, as `prepare`.
+    """Choose the cache directories with `prepare`.
 
     Returns:
-        A sentence where the caches are not where they were meant to be, else None.
+        A warning if the intended directory cannot be used, else None.
 
     Raises:
-        OSError: not even a temporary directory can be made.
+        OSError: not even a temporary directory can be created.
     """
     meant = environ.get("NUMBA_CACHE_DIR") or environ.get("CACHE_DIRECTORY", "").split(":")[0] or environ.get("HOME")
     directory = prepare(environ)
@@ -118,7 +118,7 @@ def place_of_caches(environ: MutableMapping[str, str]) -> str | None:
 
 
 def compile_ahead() -> None:
-    """Call everything that is compiled, and index the fonts that reports are drawn with."""
+    """Call all compiled functions, and index the fonts that reports use."""
     import numpy as np
     from matplotlib.font_manager import findfont
 
@@ -129,17 +129,17 @@ def compile_ahead() -> None:
 
     findfont("DejaVu Sans")
     source = load_rig(_RIG)
-    # What the kinematics explain asks for no long search for effects, and leaves nothing to learn.
+    # Fixes that the kinematics explain need no long search for effects and leave no residual to learn.
     well, badly = ((source.rig, source.text, _invented(source.rig, error)) for error in (0.0, _JOINT_ERROR_DEG))
     calibrate(*well, residual="none", run=_one_round())
     calibrate(*badly, effects="none", run=_one_round())
     calibrate(*badly, method="pde-paper", residual="none", run=_one_round())
-    gram(np.eye(_CURVES))  # so few fixes ask for no curves of many splines
-    Forest.build([()]).predict(np.zeros((1, 1)), np.zeros(1, dtype=np.int64))  # nor for trees
+    gram(np.eye(_CURVES))  # with so few fixes the calibrations need no curves of many splines
+    Forest.build([()]).predict(np.zeros((1, 1)), np.zeros(1, dtype=np.int64))  # and no trees
 
 
 def _invented(rig: Rig, joint_error_deg: float) -> Observations:
-    """Invent fixes of all prisms in random poses, with joint errors beyond what the kinematics can say."""
+    """Make synthetic fixes of all prisms in random poses, with joint errors that the kinematics cannot represent."""
     import numpy as np
 
     from calibration.kinematics.chain import Chain, ChainData, Placement
@@ -165,20 +165,20 @@ def _invented(rig: Rig, joint_error_deg: float) -> Observations:
 
 
 def _one_round() -> Run:
-    """Return a run whose search stops after one round, which calls everything."""
+    """Return run settings whose search stops after one round, which calls all kernels."""
     from calibration.run_settings import Run
 
     return Run(should_stop=itertools.chain([False], itertools.repeat(True)).__next__)
 
 
 def main(environ: MutableMapping[str, str] = os.environ) -> int:
-    """Compile ahead; the exit status is 0 whatever comes of it."""
+    """Compile ahead; the exit status is always 0."""
     try:
         displaced = place_of_caches(environ)
         if displaced is not None:
             print(f"rigcal warm-up: {displaced}", file=sys.stderr)
         compile_ahead()
-    except Exception as error:  # noqa: BLE001 - a set-up must not end for want of a head start
+    except Exception as error:  # noqa: BLE001 - set-up must not fail because compiling ahead did
         print(
             f"rigcal warm-up: {type(error).__name__}: {error}; the first calibration compiles instead", file=sys.stderr
         )

@@ -1,1 +1,1 @@
-"""The benchmark of the gap workflow: blind cases, answers of worker processes, scores."""
+"""Benchmark of the gap workflow: blind cases, answers from worker processes, scores."""

@@ -1,4 +1,4 @@
-"""Analysis of a case by a worker process, which is given observations and a rig, and nothing else."""
+"""Analysis of a case in a worker process, which gets only the observations and the rig."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ class Task:
     """Input of a worker.
 
     Attributes:
-        case: its name.
-        rig: name or path.
+        case: name of the case.
+        rig: name of a shipped rig, or path of a rig file.
         train: an observations CSV.
-        held_out: readings of further poses, without positions.
+        held_out: a CSV of readings at held-out poses, without positions.
         without: families left out of the library.
     """
 
@@ -34,9 +34,11 @@ class Task:
 
 
 def answer(task: Task) -> dict[str, Any]:
-    """Run the gap workflow on a case; returns its JSON object, with predictions of the held-out poses and seconds.
+    """Run the gap workflow on a case.
 
-    A case that ends in an error is answered with verdict `failed`.
+    Returns:
+        The JSON object of the workflow, with predicted held-out positions (`before_mm`, `after_mm`) and `seconds`; a
+        case that ends in an error has the verdict `failed`.
     """
     prepare()
     from calibration.effects.library import library
@@ -61,14 +63,14 @@ def answer(task: Task) -> dict[str, Any]:
         told |= gap.as_dict()
         told["before_mm"] = Predictor.of(gap.model).geometric_mm(held_out).round(4).tolist()
         told["after_mm"] = Predictor.of(gap.model).effects_mm(held_out).round(4).tolist()
-    except Exception as error:  # noqa: BLE001 - a case that fails is a result, and hours of other cases are not lost
+    except Exception as error:  # noqa: BLE001 - a failing case is a result and must not lose hours of other cases
         told["seconds"] = (clock.monotonic_ns() - started_ns) / NS_PER_S
         told |= {"verdict": "failed", "error": str(error), "traceback": traceback.format_exc()}
     return told
 
 
 def oracle(task: Task) -> dict[str, Any]:
-    """Predict the held-out poses with kinematics that are fitted to the case's twin without effects."""
+    """Predict the held-out poses with kinematics fitted to the case's twin, which has no effects."""
     prepare()
     from calibration.observations import parse_observations
     from calibration.pipeline.calibrate import identify
@@ -81,6 +83,6 @@ def oracle(task: Task) -> dict[str, Any]:
 
 
 def proposed_poses(told: Mapping[str, Any], number: int) -> list[dict[str, Any]]:
-    """Return the first poses that an answer proposes, as a plan's rows."""
+    """Return the first `number` poses that an answer proposes, as rows of a plan."""
     rows = [row for experiment in told.get("experiments", ()) for row in experiment.get("poses", ())]
     return rows[:number]

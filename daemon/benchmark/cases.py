@@ -1,6 +1,6 @@
-"""Cases of the benchmark as files: a process of the simulators draws them, so that the analysis knows nothing of it.
+"""Cases of the benchmark as files; a separate simulator process draws them, so that the analysis stays blind.
 
-The hidden effects are in a file of their own, `LABELS`, that no worker is given.
+The hidden effects are in a separate file, `LABELS`, that no worker gets.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-# -P keeps the current directory off the process's path, so that no file there is imported in place of a module.
+# -P keeps the current directory off the module search path, so that no file there is imported.
 COMMAND = (sys.executable, "-P", "-m", "simulators.blind.case_files")
 CASES, LABELS = "cases.json", "labels.json"
 _PLAN = "poses.json"
@@ -25,7 +25,7 @@ class CasesError(Exception):
 
 
 class NoSuchCasesError(CasesError):
-    """No case is selected by the options; the message names the known values."""
+    """The options select no case; the message lists the known values."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Case:
 
     Attributes:
         name: of the case; it does not depend on the label.
-        directory: its files.
+        directory: directory of its files.
         without: families to leave out of the library.
     """
 
@@ -43,7 +43,11 @@ class Case:
     without: tuple[str, ...]
 
     def csv(self, kind: str = "") -> bytes:
-        """Content of one of its files: observations, `-held-out` readings, `-twin` or `-measured` observations."""
+        """Return a file of the case.
+
+        Args:
+            kind: "" for observations, `-held-out` for readings, `-twin` or `-measured` for further observations.
+        """
         return (self.directory / f"{self.name}{kind}.csv").read_bytes()
 
 
@@ -51,8 +55,8 @@ def draw_cases(rig: str, options: Sequence[str], directory: Path) -> tuple[Case,
     """Draw cases into a directory.
 
     Args:
-        rig: shipped name or path.
-        options: the selection, as `python -m simulators.blind.case_files draw` takes it.
+        rig: name of a shipped rig, or path of a rig file.
+        options: the selection, as options of `python -m simulators.blind.case_files draw`.
         directory: for the files.
 
     Raises:
@@ -65,15 +69,15 @@ def draw_cases(rig: str, options: Sequence[str], directory: Path) -> tuple[Case,
 
 
 def measure(rig: str, poses: Mapping[str, Sequence[Mapping[str, Any]]], directory: Path) -> None:
-    """Measure further poses of cases, as a plan's rows ask for; a case then has `-measured` observations.
+    """Measure additional poses of cases and write them as `-measured` observations.
 
     Args:
-        rig: as drawn with.
-        poses: case -> rows.
-        directory: as drawn into.
+        rig: the rig that the cases were drawn with.
+        poses: case -> rows of a plan.
+        directory: directory that the cases were drawn into.
 
     Raises:
-        CasesError: no such case, or a row lacks a joint.
+        CasesError: there is no such case, or a row lacks a joint.
     """
     plan = directory / _PLAN
     plan.write_text(json.dumps(poses), encoding="utf-8")
@@ -81,7 +85,7 @@ def measure(rig: str, poses: Mapping[str, Sequence[Mapping[str, Any]]], director
 
 
 def read_labels(directory: Path) -> dict[str, Any]:
-    """Labels of all cases (`labels`), rules of drawing and judging (`rules`), and cells without a case (`dropped`)."""
+    """Return labels of all cases (`labels`), rules of drawing and judging (`rules`) and empty cells (`dropped`)."""
     labels: dict[str, Any] = json.loads((directory / LABELS).read_text(encoding="utf-8"))
     return labels
 

@@ -1,8 +1,8 @@
-"""The part of the data in which a hidden effect acts, and how an answer tells it.
+"""The regime, the part of the data in which a hidden effect acts, and its comparison with an answer.
 
 An effect of an answer has `regime`: null for all rows, or `{"variable": text, "above": bool, "border": number}`. The
-variable is a joint (its reading, deg or mm), `torque(JOINT)` (N m, or N), an observation column, or `row` (the row's
-number, from 0) where the data have no time.
+variable is a joint (its reading, deg or mm), `torque(JOINT)` (N m or N), an observation column, or, in data without
+time, `row` (the row number, from 0).
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ class TrueRegime:
     """The part of the data in which a hidden effect acts.
 
     Attributes:
-        variable: see the module.
-        above: in the rows above the border; else in all others.
+        variable: as in the module's docstring.
+        above: True if the effect acts in the rows above the border, False if in the other rows.
         border: in the variable's unit.
-        low, high: a border between these is right.
+        low, high: bounds within which a reported border is right.
     """
 
     variable: str
@@ -32,7 +32,7 @@ class TrueRegime:
     high: float
 
     def is_part(self, told: Mapping[str, Any] | None) -> bool:
-        """Return whether an answer names this variable and this side of it."""
+        """Return True if a reported regime has this variable and this side of the border."""
         if told is None:
             return False
         variable = str(told["variable"])
@@ -41,11 +41,11 @@ class TrueRegime:
         return variable == self.variable and bool(told["above"]) == self.above
 
     def is_border(self, told: Mapping[str, Any] | None) -> bool:
-        """Return whether an answer names this part, with a border that is right."""
+        """Return True if a reported regime is this part of the data with a right border."""
         return told is not None and self.is_part(told) and self.low <= float(told["border"]) <= self.high
 
 
 def regime_of(effect: Mapping[str, Any]) -> Mapping[str, Any] | None:
-    """Return the part of the data in which an effect of an answer acts; None for all rows."""
+    """Return the regime of an effect of an answer; None for all rows."""
     regime: Mapping[str, Any] | None = effect.get("regime")
     return regime

@@ -1,4 +1,4 @@
-"""A run of the benchmark: cases drawn, analysed by worker processes that see no label, and scored."""
+"""A run of the benchmark: draws cases, analyses them in worker processes that see no label, and scores the answers."""
 
 from __future__ import annotations
 
@@ -22,24 +22,24 @@ from daemon.benchmark.trial import Trial, trial
 from daemon.host.safe_output import write_file
 
 ANSWERS = "answers.json"
-PROPOSED = 20  # poses that a set may ask for
-MEASURED = ("single", "alias")  # kinds of case of which such poses are measured
-# Shares of a run's time, for its progress.
+PROPOSED = 20  # how many of the poses proposed for a set are measured
+MEASURED = ("single", "alias")  # kinds of case for which proposed poses are measured
+# Shares of a run's time, for the progress.
 _DRAWN, _ANSWERED = 0.05, 0.9
 
 
 @dataclass(frozen=True)
-class Run:
+class BenchmarkResult:
     """Result of a run.
 
     Attributes:
-        rig: shipped name or path.
-        labels_sha256, answers_sha256: checksums of the files, by which two runs can be compared.
-        rules: of drawing and judging cases, sentences.
-        dropped: cells that could not reach their size within the library's bounds -> number of cases.
-        trials: every case.
-        scores: every bar.
-        tallies: family by family.
+        rig: name of a shipped rig, or path of a rig file.
+        labels_sha256, answers_sha256: checksums of the files, for comparing two runs.
+        rules: rules of drawing and judging cases, as sentences.
+        dropped: cell that cannot reach its size within the library's bounds -> number of dropped cases.
+        trials: all cases.
+        scores: all figures of merit.
+        tallies: outcomes for each family and size.
     """
 
     rig: str
@@ -52,22 +52,22 @@ class Run:
     tallies: tuple[Tally, ...]
 
 
-def run(rig: str, options: Sequence[str], directory: Path, *, workers: int, progress: Progress) -> Run:
+def run(rig: str, options: Sequence[str], directory: Path, *, workers: int, progress: Progress) -> BenchmarkResult:
     """Draw cases, analyse and score them.
 
     Args:
-        rig: shipped name or path.
-        options: the selection of cases, as `python -m simulators.blind.case_files draw` takes it.
+        rig: name of a shipped rig, or path of a rig file.
+        options: the selection of cases, as options of `python -m simulators.blind.case_files draw`.
         directory: for observations, labels and answers.
-        workers: processes that analyse.
-        progress: told (share done, current step).
+        workers: number of worker processes.
+        progress: called with the share of the work that is done and the current step.
 
     Raises:
         CasesError: the cases could not be drawn or measured.
     """
     progress(0.0, "drawing cases")
     cases = draw_cases(rig, options, directory)
-    # Spawned: a worker holds nothing of this process.
+    # Workers are spawned, so that they share no memory with this process.
     with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), _end_with_parent) as pool:
         told = _answers(pool, [_task(rig, case) for case in cases], progress)
         labels = read_labels(directory)
@@ -92,7 +92,7 @@ def run(rig: str, options: Sequence[str], directory: Path, *, workers: int, prog
         trial(label, told[label["case"]], measured.get(label["case"]), oracles.get(label["case"]))
         for label in labels["labels"]
     )
-    return Run(
+    return BenchmarkResult(
         rig=rig,
         labels_sha256=hashlib.sha256((directory / LABELS).read_bytes()).hexdigest(),
         answers_sha256=hashlib.sha256(answers).hexdigest(),
@@ -105,7 +105,7 @@ def run(rig: str, options: Sequence[str], directory: Path, *, workers: int, prog
 
 
 def _end_with_parent() -> None:
-    """End this worker with the process that started it, however that ends."""
+    """End this worker when the process that started it ends for any reason."""
     parent = multiprocessing.parent_process()
     assert parent is not None
     threading.Thread(target=_follow, args=(parent,), name="parent", daemon=True).start()
@@ -121,7 +121,7 @@ def _task(rig: str, case: Case, observations: str = "") -> Task:
 
 
 def _answers(pool: Executor, tasks: Sequence[Task], progress: Progress) -> dict[str, dict[str, Any]]:
-    """Analyse all tasks; returns case -> answer, in the order in which they come."""
+    """Analyse all tasks; return case -> answer, in the order of completion."""
     waiting = [pool.submit(answer, task) for task in tasks]
     told: dict[str, dict[str, Any]] = {}
     for future in as_completed(waiting):

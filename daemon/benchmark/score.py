@@ -1,4 +1,4 @@
-"""Scores of the gap workflow's answers against the labels, each beside its target."""
+"""Scores of the gap workflow's answers against the labels, each with its target."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from scipy.stats import binomtest
 
 from daemon.benchmark.trial import Trial
 
-LEVEL = 0.95  # of Wilson's intervals
+LEVEL = 0.95  # confidence level of Wilson intervals
 
 T = TypeVar("T")
 
@@ -23,12 +23,12 @@ class Score:
 
     Attributes:
         what: name of the figure.
-        target: the bar in words; empty if there is no bar.
-        value: measured; NaN where no case tells.
+        target: the target in words; "" if there is none.
+        value: measured value; NaN if no case counts.
         n: number of cases that it was measured on.
-        interval: Wilson's of a share, 95 %; None for other figures.
-        met: the bar is met; None if there is no bar, or no case to tell.
-        is_chance: chance alone may explain a missed bar: the interval reaches it.
+        interval: 95 % Wilson interval of a share; None for other figures.
+        met: whether the target is met; None if there is no target or no case counts.
+        is_chance: whether chance alone may explain a missed target, as the interval includes it.
     """
 
     what: str
@@ -41,16 +41,16 @@ class Score:
 
 
 def scores(trials: Sequence[Trial]) -> tuple[Score, ...]:
-    """Every bar, and the figures beside them that have none."""
+    """Return all figures of merit, with and without a target."""
     single = [t for t in trials if t.kind == "single"]
     strong = [t for t in single if t.size >= 1.0]
     half = [t for t in single if t.size == 0.5]
     one = [t for t in single if t.size == 1.0]
     known = [t for t in trials if t.kind in ("single", "null", "decoy", "pair", "triple", "alias")]
     return (
-        *_named("named right at >= 1x, separable", strong, 0.98),
-        *_named("named right at 0.5x, separable", half, 0.95),
-        *_named("named right at 0.25x, separable", [t for t in single if t.size == 0.25], None),
+        *_named("rightly named at >= 1x, separable", strong, 0.98),
+        *_named("rightly named at 0.5x, separable", half, 0.95),
+        *_named("rightly named at 0.25x, separable", [t for t in single if t.size == 0.25], None),
         _share("wrong name among all named", [t for t in known if t.named], lambda t: t.is_wrong, most=0.01),
         *_no_effect(trials),
         *_sets(single, [t for t in trials if t.kind == "alias"]),
@@ -71,10 +71,10 @@ def scores(trials: Sequence[Trial]) -> tuple[Score, ...]:
 def _named(what: str, trials: Sequence[Trial], least: float | None) -> Iterable[Score]:
     separable = [t for t in trials if t.separable]
     yield _share(what, separable, lambda t: t.is_right, least=least)
-    yield _share("  at the right place too", separable, lambda t: t.is_in_place)
+    yield _share("  also at the right place", separable, lambda t: t.is_in_place)
     for poses in dict.fromkeys(t.poses for t in separable):
         yield _share(f"  {poses} poses", [t for t in separable if t.poses == poses], lambda t: t.is_right)
-    yield _share("  of all, separable or not", trials, lambda t: t.is_right)
+    yield _share("  of all cases, separable or not", trials, lambda t: t.is_right)
 
 
 def _no_effect(trials: Sequence[Trial]) -> Iterable[Score]:
@@ -86,11 +86,11 @@ def _no_effect(trials: Sequence[Trial]) -> Iterable[Score]:
 
 def _sets(single: Sequence[Trial], alias: Sequence[Trial]) -> Iterable[Score]:
     reported = [t for t in single if t.verdict == "indistinguishable"]
-    # One draw of the noise in fifty leaves a separable effect without the odds for a name: a set is right then.
-    told = "truth inside a reported set that could not have been a name"
+    # In one draw of the noise in fifty, even a separable effect lacks the odds for a name; a set is right then.
+    told = "truth in a reported set where no name was possible"
     yield _share(told, reported, lambda t: t.is_set_true and not t.plain, least=0.99)
-    yield _share("  the same of what is not separable", reported, lambda t: t.is_set_true and not t.separable)
-    yield _share("  truth inside it", reported, lambda t: t.is_set_true)
+    yield _share("  truth in a set of an inseparable effect", reported, lambda t: t.is_set_true and not t.separable)
+    yield _share("  truth in any set", reported, lambda t: t.is_set_true)
     sizes = [len(t.reported_set) for t in (*reported, *alias) if t.reported_set]
     yield _figure("families in a set, mean", sizes, np.mean)
     yield _share("exact aliases: set with the truth and its alias", alias, _alias_told, least=0.99)
@@ -125,11 +125,11 @@ def _strangers(trials: Sequence[Trial]) -> Iterable[Score]:
     yield _share("outside the library: right location", outside, lambda t: t.is_located, least=0.85)
     yield _share("outside the library: unidentified", outside, lambda t: t.verdict == "unidentified")
     left_out = [t for t in trials if t.kind == "left_out"]
-    misnamed = "one family left out, its data shown: misnamed"
+    misnamed = "a family left out of the library: misnamed"
     yield _share(misnamed, left_out, lambda t: bool(t.named - t.general), most=0.03)
-    yield _share("  or given the name of a more general family", left_out, lambda t: bool(t.named))
+    yield _share("  misnamed or named as a more general family", left_out, lambda t: bool(t.named))
     beside = [t for t in trials if t.kind == "beside"]
-    yield _share("beside an effect outside the library: named right", beside, lambda t: t.is_right)
+    yield _share("with an effect outside the library: rightly named", beside, lambda t: t.is_right)
     yield _share("  misnamed", beside, lambda t: t.is_wrong)
 
 
@@ -143,8 +143,8 @@ def _coefficients(trials: Sequence[Trial]) -> Iterable[Score]:
 
 def _machines(trials: Sequence[Trial]) -> Iterable[Score]:
     told = [one for t in trials for one in t.effects_told]
-    yield _share("machine: effects named with their place", told, lambda one: one[1], least=0.85)
-    yield _share("  of those that the data tell apart", [o for o in told if o[0].separable], lambda one: one[1])
+    yield _share("machine: effects named at their place", told, lambda one: one[1], least=0.85)
+    yield _share("  of those that the data distinguish", [o for o in told if o[0].separable], lambda one: one[1])
     for poses in dict.fromkeys(t.poses for t in trials):
         own = [one for t in trials if t.poses == poses for one in t.effects_told]
         yield _share(f"  {poses} poses", own, lambda one: one[1])
@@ -155,29 +155,29 @@ def _machines(trials: Sequence[Trial]) -> Iterable[Score]:
     closed = "machine: held-out gap closed to the unknown structure"
     yield _figure(f"{closed}, median", shares, np.median, least=0.90)
     yield _figure(f"{closed}, 10th percentile", shares, lambda values: np.percentile(values, 10))
-    yield _figure("machine: seconds a case, median", [t.answer["seconds"] for t in trials], np.median)
+    yield _figure("machine: seconds per case, median", [t.answer["seconds"] for t in trials], np.median)
 
 
 def _regimes(trials: Sequence[Trial]) -> Iterable[Score]:
     yield _share("regime: effect, part and border named", trials, lambda t: t.is_border_right, least=0.85)
-    yield _share("  effect and part, whatever the border", trials, lambda t: t.is_regime_named)
-    yield _share("  effect, whatever the part", trials, lambda t: all(named for _, named in t.effects_told))
+    yield _share("  effect and part, any border", trials, lambda t: t.is_regime_named)
+    yield _share("  effect, any part", trials, lambda t: all(named for _, named in t.effects_told))
     wrong = [is_wrong for t in trials for is_wrong in t.names_told]
     yield _share("regime: wrong name, place or part among all named", wrong, bool, most=0.02)
 
 
 def _paths(trials: Sequence[Trial]) -> Iterable[Score]:
-    what = "no effect, noise wanders along a path: named, also in a set"
+    what = "no effect, noise wandering along a path: named, also in a set"
     yield _share(what, trials, lambda t: bool(t.named | t.reported_set), most=0.0)
     yield _share("  any alarm", trials, lambda t: t.verdict != "none")
 
 
 def _seconds(trials: Sequence[Trial]) -> Iterable[Score]:
     nulls = [t.answer["seconds"] for t in trials if t.kind == "null"]
-    yield _figure("seconds a case without effect, median", nulls, np.median)
+    yield _figure("seconds per case without effect, median", nulls, np.median)
     every = [t.answer["seconds"] for t in trials]
-    yield _figure("seconds a case, median", every, np.median)
-    yield _figure("seconds a case, 95th percentile", every, lambda values: np.percentile(values, 95))
+    yield _figure("seconds per case, median", every, np.median)
+    yield _figure("seconds per case, 95th percentile", every, lambda values: np.percentile(values, 95))
 
 
 def _share(
@@ -222,8 +222,8 @@ class Tally:
 
     Attributes:
         family, size: of the cell, over all poses and noises.
-        outcomes: word -> number of cases, as `Trial.outcome`.
-        mistaken: families named or put in a set in its place -> number of cases.
+        outcomes: outcome, as in `Trial.outcome` -> number of cases.
+        mistaken: family that was named or reported in a set instead -> number of cases.
     """
 
     family: str
@@ -233,7 +233,7 @@ class Tally:
 
 
 def tallies(trials: Sequence[Trial]) -> tuple[Tally, ...]:
-    """Family by family and size by size, of the cases with a single effect of the library."""
+    """Return a tally for each family and size of the cases with a single effect of the library."""
     single = [t for t in trials if t.kind == "single"]
     cells = sorted({(t.effects[0].family, t.size) for t in single})
     return tuple(

@@ -1,4 +1,4 @@
-"""Every command's end: exit status, one sentence or one JSON object; and the progress of long ones."""
+"""What all commands share: exit status, error messages, JSON output, and the progress display of long commands."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from calibration.run_settings import Progress
 
 DONE, FAILED, WRONG_INPUT, REFUSED = 0, 1, 2, 3
-LINE_S = 15.0  # between two lines of progress where no person is watching
-_REDRAW_S = 0.2  # between two looks of the progress on a terminal
+LINE_S = 15.0  # between lines of progress if standard error is not a terminal
+_REDRAW_S = 0.2  # between updates of the progress bar on a terminal
 _BAR = 40  # characters
 
 
@@ -42,29 +42,29 @@ def exit_status(error: BaseException) -> int:
 
 
 def error_sentence(error: BaseException) -> str:
-    """Return what went wrong in one line, for people."""
+    """Return the error in one line, for people."""
     if isinstance(error, click.ClickException):
         return error.format_message()
     if isinstance(error, OSError) and error.strerror:
         return f"{error.filename}: {error.strerror}" if error.filename else error.strerror
     if type(error).__name__ == "ConfigError":
-        return str(error)  # a line for each wrong key
+        return str(error)  # one line for each wrong key
     text = " ".join(str(error).split())
     if type(error).__module__.partition(".")[0] in ("calibration", "drivers", "daemon", "simulators"):
         return text or type(error).__name__
-    return f"internal error, {type(error).__name__}: {text} (RIGCAL_DEBUG=1 shows where)"
+    return f"internal error, {type(error).__name__}: {text} (RIGCAL_DEBUG=1 adds a traceback)"
 
 
 @dataclass(frozen=True)
 class Delivered:
-    """The result of a command that delivers it although its exit status is not 0."""
+    """The result of a command together with an exit status that need not be 0."""
 
     result: Mapping[str, Any]
     status: int
 
 
 class Command(click.Command):
-    """A command whose every failure is one sentence on standard error and an exit status, never a traceback.
+    """A command that reports a failure as one sentence on standard error and an exit status, without a traceback.
 
     With `--json` the failure is also the one JSON object on standard output: `{"error": SENTENCE, "kind": CLASS}`.
     RIGCAL_DEBUG=1 in the environment adds the traceback.
@@ -88,14 +88,14 @@ class Command(click.Command):
     def invoke(self, ctx: click.Context) -> Any:
         as_json = bool(ctx.params.get("as_json"))
         try:
-            # What a library prints must not end up in the result.
+            # The output of a library must not get into the result.
             with contextlib.redirect_stdout(sys.stderr) if as_json else contextlib.nullcontext():
                 returned = super().invoke(ctx)
         except (click.exceptions.Exit, click.Abort):
             raise
-        except Exception as error:  # the last place where a failure can become a sentence
+        except Exception as error:  # the last place to turn a failure into a sentence
             if isinstance(error, BrokenPipeError) and _reader_has_ended():
-                raise  # click ends the command without a word
+                raise  # click ends the command silently
             _end_badly(error, as_json=as_json)
         delivered = returned if isinstance(returned, Delivered) else Delivered(returned, DONE)
         if as_json:
@@ -106,10 +106,10 @@ class Command(click.Command):
 
 
 def _refuse_empty(args: Sequence[str]) -> None:
-    """Refuse an empty argument, as of a variable that is not set: it would pass for none, or for the present directory.
+    """Refuse an empty argument, as from an unset variable: it would count as none or as the current directory.
 
     Raises:
-        click.UsageError: says which.
+        click.UsageError: an argument is empty; the message names it.
     """
     for before, given in pairwise(["", *args]):
         option, equals, value = given.partition("=")
@@ -117,13 +117,11 @@ def _refuse_empty(args: Sequence[str]) -> None:
         if given and not is_empty_option:
             continue
         named = option if is_empty_option else before if before.startswith("-") else "an argument"
-        raise click.UsageError(
-            f"{named} is empty; give it a value, or leave it out (is a variable of the shell not set?)"
-        )
+        raise click.UsageError(f"{named} is empty; give it a value or omit it (is a shell variable not set?)")
 
 
 def _reader_has_ended() -> bool:
-    """True if nothing reads standard output any more, as after `| head`."""
+    """Return True if nothing reads standard output any more, as after `| head`."""
     poll = select.poll()
     poll.register(1, 0)
     return any(event & select.POLLERR for _, event in poll.poll(0))
@@ -150,20 +148,20 @@ def print_json(result: Mapping[str, Any]) -> None:
 
 
 def stream_json(result: Mapping[str, Any]) -> None:
-    """Print one JSON object on a line of its own, while a command with `--json` goes on: standard output is kept."""
+    """Print one JSON object per line while a command with `--json` runs, bypassing the redirected standard output."""
     click.echo(json_line(result), file=sys.__stdout__)
 
 
 @contextlib.contextmanager
 def progress_display(*, as_json: bool) -> Iterator[Progress]:
-    """Show on standard error how far long work is: a bar where a person is watching, else a line now and then.
+    """Show the progress of long work on standard error: as a bar on a terminal, else as a line every `LINE_S`.
 
-    Short work says nothing. The first calibration of a computer compiles what it runs, which is said beforehand.
+    Short work shows nothing. The first calibration on a computer compiles kernels, which is announced.
     """
     from daemon.warm_up import is_compiled
 
     if not is_compiled():
-        echo_error("Compiling kernels first, once on this computer: half a minute or more")
+        echo_error("Compiling kernels, only once on this computer; this takes half a minute or more")
     is_watched = sys.stderr.isatty() and not as_json
     every_s = _REDRAW_S if is_watched else LINE_S
     now = (0.0, "starting")
@@ -179,7 +177,7 @@ def progress_display(*, as_json: bool) -> Iterator[Progress]:
             seconds += every_s
             share, text = now
             if is_watched:
-                bar = "#" * min(round(_BAR * share), _BAR - 1)  # full only when there is nothing left to show
+                bar = "#" * min(round(_BAR * share), _BAR - 1)  # never full while work goes on
                 click.echo(f"\r\x1b[K[{bar:{_BAR}}] {seconds:.0f} s  {shown(text)}", nl=False, err=True)
             else:
                 echo_error(f"{seconds:.0f} s: {text} ({percent(share)})")

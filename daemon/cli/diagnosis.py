@@ -1,6 +1,6 @@
-"""Findings of `rigcal doctor` on the computer, the configuration, and a running daemon.
+"""Checks of `rigcal doctor` on the computer, the configuration, and a running daemon.
 
-Nothing is sent to any bus, instrument or server, no device is opened, and nothing is changed.
+They send nothing to a bus, instrument or server, open no device, and change nothing.
 """
 
 from __future__ import annotations
@@ -28,22 +28,22 @@ _NETWORKD = "edit /etc/systemd/network/80-can0.network, then `systemctl restart 
 _USUAL_RATE = 250_000  # bit/s
 _RULES_FILE = "/etc/udev/rules.d/99-rigcal-station.rules"
 _RELOAD_RULES = "`udevadm control --reload && udevadm trigger`"
-_OFTEN = 10  # silences of one channel since the start, from which on its time-out may be too short
-_LEAST_FREE = 0.1  # of the disk
-_BUSY = 1.5  # processes that want to run, for each processor, over the last minute
+_OFTEN = 10  # number of silences of a channel since the start that suggests a too short timeout
+_LEAST_FREE = 0.1  # share of the disk
+_BUSY = 1.5  # runnable processes per processor, averaged over the last minute
 _TIME_ERROR = 5  # adjtimex(2): the clock is not synchronised
 _TOOL_TIMEOUT_S = 10.0
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that was looked at.
+    """The result of one check.
 
     Attributes:
-        subject: its name.
-        state: good, warning (works, and may not for long), fault, or unknown (could not be looked at).
+        subject: what was checked.
+        state: good, warning (works, but may soon fail), fault, or unknown (could not be checked).
         text: what was found.
-        remedy: what to type or do; "" where nothing needs doing.
+        remedy: what to type or do; "" if nothing is needed.
     """
 
     subject: str
@@ -60,10 +60,10 @@ class Finding:
 
 
 def computer(config: Config | None) -> Iterator[Finding]:
-    """Look at the clock, the disk, the place of the backups, and whether the kernels are compiled.
+    """Check the clock, the processor, the disk, the directory of backups, and whether the kernels are compiled.
 
     Args:
-        config: of the daemon; None where there is none.
+        config: of the daemon; None if there is none.
     """
     yield _clock()
     yield _processor()
@@ -75,46 +75,46 @@ def computer(config: Config | None) -> Iterator[Finding]:
     if is_compiled():
         yield Finding("kernels", "good", "are compiled")
     else:
-        remedy = "`python -m daemon.warm_up`, with the Python of rigcal, compiles them now"
+        remedy = "`python -m daemon.warm_up`, run by rigcal's Python, compiles them now"
         yield Finding(
-            "kernels", "warning", "are not compiled yet: the first calibration takes half a minute more", remedy
+            "kernels", "warning", "are not compiled yet: the first calibration takes half a minute longer", remedy
         )
 
 
 def _clock() -> Finding:
     try:
-        state = ctypes.CDLL(None, use_errno=True).adjtimex(ctypes.create_string_buffer(512))  # only read: modes is 0
+        state = ctypes.CDLL(None, use_errno=True).adjtimex(ctypes.create_string_buffer(512))  # modes 0: reads only
     except (OSError, AttributeError):
         state = -1
     if state == -1:
-        return Finding("clock", "unknown", "the kernel does not say whether it is synchronised", "`timedatectl`")
+        return Finding("clock", "unknown", "the kernel does not report whether it is synchronised", "`timedatectl`")
     if state == _TIME_ERROR:
         return Finding(
             "clock",
             "warning",
-            "is not synchronised: records are ordered by another clock, but dates may be wrong",
+            "is not synchronised: dates may be wrong (the order of records does not depend on this clock)",
             "`timedatectl set-ntp true`, or give the network a time server (/etc/systemd/timesyncd.conf)",
         )
     return Finding("clock", "good", "is synchronised")
 
 
 def overload() -> str | None:
-    """Return a clause on a computer that has more to run than its processors can; None where they can.
+    """Return a clause about an overloaded processor; None if it is not overloaded.
 
-    What looks like a fault of a cable may be a processor that does not get round to it.
+    What looks like a faulty cable may be an overloaded processor.
     """
     processors = len(os.sched_getaffinity(0))
     wanting = os.getloadavg()[0]
     if wanting <= _BUSY * processors:
         return None
-    return f"{wanting:.0f} processes want to run on {processors} processor{'s' if processors != 1 else ''}"
+    return f"{wanting:.0f} processes compete for {processors} processor{'s' if processors != 1 else ''}"
 
 
 def _processor() -> Finding:
     if busy := overload():
-        remedy = "`top` shows what keeps it busy; a simulated rig runs slower with a lower --rate"
-        return Finding("processor", "warning", f"{busy}: devices may look silent that are not", remedy)
-    return Finding("processor", "good", "has time for more")
+        remedy = "`top` shows the busy processes; a simulated rig needs less time with a lower --rate"
+        return Finding("processor", "warning", f"{busy}: working devices may appear silent", remedy)
+    return Finding("processor", "good", "is not overloaded")
 
 
 def _disk(config: Config) -> Finding:
@@ -124,31 +124,31 @@ def _disk(config: Config) -> Finding:
     text = f"{usage.free / 2**30:.1f} GiB of {usage.total / 2**30:.0f} are free at {place}"
     if usage.free < config.store.free_bytes or usage.free < _LEAST_FREE * usage.total:
         why = f"{text}; captures outside sessions are deleted below {config.store.free_gb:g} GiB or a tenth of the disk"
-        return Finding("disk", "warning", why, f"`du -xh --max-depth=2 {existing} | sort -h` shows what takes it")
+        return Finding("disk", "warning", why, f"`du -xh --max-depth=2 {existing} | sort -h` shows what uses it")
     return Finding("disk", "good", text)
 
 
 def _backups(config: Config) -> Finding:
     directory = config.store.backup_directory
     if directory is None:
-        why = "none are made: a disk that breaks takes every session and every model with it"
-        return Finding("backups", "warning", why, "`backup_directory = ...` in [store] of the configuration")
-    remedy = f"`install -d -o rigcal -g rigcal -m 0750 {directory}`, once the disk that they go to is mounted"
+        why = "none are made: if the disk fails, all sessions and models are lost"
+        return Finding("backups", "warning", why, "set `backup_directory = ...` in [store] of the configuration")
+    remedy = f"mount the disk for backups, then `install -d -o rigcal -g rigcal -m 0750 {directory}`"
     try:
         owner = directory.stat().st_uid
         if config.state_directory.exists() and owner != config.state_directory.stat().st_uid:
-            why = f"{directory} is not of the user of {config.state_directory}, who has to write there"
+            why = f"{directory} does not belong to the owner of {config.state_directory}, who must write there"
             return Finding("backups", "warning", why, remedy)
     except OSError as error:
         return Finding("backups", "warning", f"{directory}: {error.strerror}", remedy)
-    return Finding("backups", "good", f"go to {directory}")
+    return Finding("backups", "good", f"are written to {directory}")
 
 
 # ---- the configuration -----------------------------------------------------------------------------------------------
 
 
 def read_configuration(path: Path) -> tuple[Config | None, Finding]:
-    """Read a configuration with its rig and the files that these name; return it, and whether it is good."""
+    """Read a configuration with its rig and their DBC and EDS files; return it (None if unreadable) and the finding."""
     from calibration.errors import RigError
     from daemon.commands import CommandError
     from daemon.composition import decoders
@@ -163,13 +163,13 @@ def read_configuration(path: Path) -> tuple[Config | None, Finding]:
         decoders(config, source)
     except (CommandError, RigError, DescriptionError) as error:
         return config, Finding(
-            "configuration", "fault", str(error), f"mend it; `rigcal config check {path}` reads it again"
+            "configuration", "fault", str(error), f"correct it, then run `rigcal config check {path}`"
         )
     return config, Finding("configuration", "good", f"{path}: rig {source.rig.name}")
 
 
 def devices(config: Config) -> Iterator[Finding]:
-    """Look at the interfaces and ports of a configuration without opening them."""
+    """Check the interfaces and ports of a configuration without opening them."""
     for section in config.can:
         if section.interface == "socketcan":
             yield can_interface(section, _link_details(section.channel), NETWORK_DEVICES / section.channel)
@@ -180,12 +180,12 @@ def devices(config: Config) -> Iterator[Finding]:
             )
     for station in config.station:
         plug_in = f"plug it in; put its serial number into {_RULES_FILE}, then {_RELOAD_RULES}"
-        key, lasting = "[station.serial] path", f"the name that {_RULES_FILE} gives the adapter"
+        key, lasting = "[station.serial] path", f"the name that {_RULES_FILE} gives to the adapter"
         yield _serial_port(station.name, Path(station.serial.path), key, plug_in, lasting)
 
 
 def _link_details(channel: str) -> Mapping[str, Any] | None:
-    """Return what `ip` (iproute2) tells of an interface; None where it cannot be asked."""
+    """Return the output of `ip` (iproute2) about an interface; None if `ip` fails."""
     command = ["ip", "-json", "-details", "link", "show", "dev", channel]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=_TOOL_TIMEOUT_S, check=False)
@@ -195,19 +195,19 @@ def _link_details(channel: str) -> Mapping[str, Any] | None:
 
 
 def can_interface(section: CanSection, details: Mapping[str, Any] | None, device: Path) -> Finding:
-    """Judge a CAN interface: there, up, listen-only unless the link may send, and of the configured bit rate.
+    """Check a CAN interface: present, up, listen-only unless the link may send, and with the configured bit rate.
 
     Args:
         section: the link.
-        details: what `ip -json -details link show` tells of its interface; None where it cannot be asked.
+        details: output of `ip -json -details link show` about its interface; None if `ip` failed.
         device: the interface's directory in /sys.
     """
     name = section.channel
     if not device.exists():
-        seen = "`ip -details link show type can` shows those that there are; `dmesg` what became of the adapter"
+        seen = "`ip -details link show type can` lists the CAN interfaces, `dmesg` shows messages about the adapter"
         return Finding(name, "fault", f"there is no such interface (link {section.name})", seen)
     if details is None:
-        return Finding(name, "unknown", "its settings cannot be read", "`apt install iproute2` brings the program ip")
+        return Finding(name, "unknown", "its settings cannot be read", "install the program ip: `apt install iproute2`")
     if "UP" not in details.get("flags", ()):
         up = f"`ip link set {name} up type can bitrate {section.bitrate or _USUAL_RATE} listen-only on`, or {_NETWORKD}"
         return Finding(name, "fault", "the interface is down", up)
@@ -218,7 +218,7 @@ def can_interface(section: CanSection, details: Mapping[str, Any] | None, device
 
 
 def _controller(section: CanSection, data: Mapping[str, Any]) -> Finding:
-    """Judge the controller of an interface that is up, by what the kernel tells of it."""
+    """Check the controller of an interface that is up, from the data that the kernel reports."""
     rate, state = data.get("bittiming", {}).get("bitrate"), str(data.get("state", ""))
     is_listening = "LISTEN-ONLY" in data.get("ctrlmode", ())
     text = f"is up at {rate or 0:,} bit/s, {'listen-only' if is_listening else 'may transmit'}, {state.lower()}"
@@ -245,16 +245,14 @@ def _serial_port(name: str, path: Path, key: str, plug_in: str, lasting: str) ->
         found = f"plugged in: {plugged}" if plugged else "no serial adapter is plugged in"
         return Finding(name, "fault", f"{path} does not exist; {found}", plug_in)
     if not path.is_char_device():
-        return Finding(name, "fault", f"{path} is no serial port", f"correct {key}")
+        return Finding(name, "fault", f"{path} is not a serial port", f"correct {key}")
     if not os.access(path, os.R_OK | os.W_OK):
-        remedy = f"join its group: `sudo adduser {_user()} dialout`, then log in anew (the service has it already)"
-        return Finding(name, "fault", f"{path} may not be opened by {_user()}", remedy)
+        remedy = f"join its group: `sudo adduser {_user()} dialout`, then log in again (the service is in it already)"
+        return Finding(name, "fault", f"{_user()} has no permission to open {path}", remedy)
     if path.resolve().name.startswith(("ttyUSB", "ttyACM")) and not path.is_symlink():
         remedy = f"use {lasting} as {key}"
-        return Finding(
-            name, "warning", f"{path} names a socket, not an adapter: it may be another one after a restart", remedy
-        )
-    target = f" is {path.resolve()}" if path.is_symlink() else " is there"
+        return Finding(name, "warning", f"{path} may name a different adapter after a restart", remedy)
+    target = f" is {path.resolve()}" if path.is_symlink() else " exists"
     return Finding(name, "good", f"{path}{target}")
 
 
@@ -271,20 +269,24 @@ def _user() -> str:
 
 
 def socket_finding(error: str) -> Finding:
-    """Return the finding that the daemon cannot be asked, from the client's error."""
-    remedy = "`systemctl status rigcal` says whether it runs, `journalctl -u rigcal -n 50` why not"
+    """Return the finding for a daemon that does not answer.
+
+    Args:
+        error: the client's error.
+    """
+    remedy = "`systemctl status rigcal` shows whether it runs, `journalctl -u rigcal -n 50` why not"
     return Finding("daemon", "fault", error, remedy)
 
 
 def daemon_state(status: Mapping[str, Any], version: str) -> Iterator[Finding]:
-    """Judge what a running daemon tells: version, store, links, channels, station, time-outs, alarms.
+    """Check the status of a running daemon: version, store, links, channels, station, timeouts, alarms.
 
     Args:
-        status: its state.
+        status: the daemon's state.
         version: of this program.
     """
     if status.get("version", version) != version:
-        text = f"version {status['version']} runs, and this program is {version}"
+        text = f"version {status['version']} is running, but this program is version {version}"
         yield Finding("daemon", "warning", text, "`systemctl restart rigcal`")
     else:
         yield Finding("daemon", "good", f"answers, {status['mode']}, version {version}")
@@ -293,7 +295,7 @@ def daemon_state(status: Mapping[str, Any], version: str) -> Iterator[Finding]:
         yield Finding("store", "good", f"{status['store']}: {store['text'] or 'no fault is known'}")
     else:
         yield Finding(
-            "store", "fault", store["text"], "`rigcal store check` reads all of it; docs/how-to/back-up.md says more"
+            "store", "fault", store["text"], "`rigcal store check` checks all of it; see docs/how-to/back-up.md"
         )
     for link in acquisition["links"]:
         yield _link(link)
@@ -305,7 +307,7 @@ def daemon_state(status: Mapping[str, Any], version: str) -> Iterator[Finding]:
     if alarms:
         is_critical = any(alarm["severity"] == "critical" for alarm in alarms)
         named = ", ".join(f"{alarm['kind']} {alarm['subject']}" for alarm in alarms)
-        yield Finding("alarms", "fault" if is_critical else "warning", named, "`rigcal alarms` says what to do")
+        yield Finding("alarms", "fault" if is_critical else "warning", named, "`rigcal alarms` shows what to do")
     else:
         yield Finding("alarms", "good", "none")
 
@@ -316,16 +318,16 @@ def _link(link: Mapping[str, Any]) -> Finding:
             f"link {link['name']}", "fault", link["reason"] or "is closed", "check plug, adapter and its power"
         )
     if link["up"] and not link["captures_per_s"]:
-        remedy = "check that the device is switched on, the cable, and the bit rate or baud: a wrong one looks the same"
-        return Finding(f"link {link['name']}", "fault", "is open, and nothing is heard", remedy)
+        remedy = "check the device's power, the cable, and the bit rate or baud: a wrong rate looks the same"
+        return Finding(f"link {link['name']}", "fault", "is open, but receives nothing", remedy)
     if link["dropped"]:
         text = f"{link['dropped']} captures were lost since the start: the computer or its disk is too slow"
-        return Finding(f"link {link['name']}", "warning", text, "`top` shows what keeps it busy")
+        return Finding(f"link {link['name']}", "warning", text, "`top` shows the busy processes")
     return Finding(f"link {link['name']}", "good", f"{link['captures_per_s']:.0f} captures/s")
 
 
 def _channels(channels: list[Mapping[str, Any]]) -> Iterator[Finding]:
-    """Judge joints and signals; those of a kind that lack for the same reason are one finding."""
+    """Check joints and signals; channels of one kind that fail for the same reason share a finding."""
     groups: dict[tuple[str, str], list[str]] = {}
     for channel in channels:
         if channel["status"] != "ok":
@@ -335,7 +337,7 @@ def _channels(channels: list[Mapping[str, Any]]) -> Iterator[Finding]:
         yield Finding("channels", "good", f"all {len(channels)} joints and signals are read")
     for (kind, since), names in groups.items():
         state: State = "fault" if kind == "joint" else "warning"
-        remedy = "check power and cable; `rigcal status --frames` shows which identifiers are heard"
+        remedy = "check power and cable; `rigcal status --frames` shows which identifiers are received"
         yield Finding(f"{kind}s", state, f"{since}: {', '.join(names)}", remedy)
 
 
@@ -349,7 +351,7 @@ def _station(station: Mapping[str, Any]) -> Finding:
 
 
 def _time_outs(acquisition: Mapping[str, Any]) -> Iterator[Finding]:
-    """Find channels that fall silent and come back so often that their time-out may be too short."""
+    """Find channels that fall silent and return so often that their timeout may be too short."""
     often = {
         gap["channel"]: gap["count"]
         for gap in acquisition.get("gap_counts", ())
@@ -357,9 +359,9 @@ def _time_outs(acquisition: Mapping[str, Any]) -> Iterator[Finding]:
     }
     for name, count in often.items():
         remedy = (
-            f"look at its cable; if the device is only slow, give channel {name} of the rig file a longer timeout_s "
-            "(a station: silence_timeout_s)"
+            f"check its cable; if the device is only slow, give channel {name} of the rig file a longer timeout_s "
+            "(for a station: silence_timeout_s)"
         )
-        yield Finding(f"time-out of {name}", "warning", f"silent {count} times since the start", remedy)
+        yield Finding(f"timeout of {name}", "warning", f"silent {count} times since the start", remedy)
     if not often:
-        yield Finding("time-outs", "good", "no channel falls silent again and again")
+        yield Finding("timeouts", "good", "no channel falls silent repeatedly")

@@ -1,4 +1,4 @@
-"""`rigcal session guide` on a terminal: live lines and keys; plain lines where nobody is watching."""
+"""`rigcal session guide` on a terminal: live lines and keys on a terminal, else plain lines."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ from daemon.commands import WRONG_USE, CommandError
 from daemon.host.safe_output import shown
 
 LOOK_S = 0.2
-GO_ON = "`rigcal session guide` goes on with it"
+GO_ON = "`rigcal session guide` resumes it"
 _BAR = 20  # characters
 
 Say = Callable[..., Mapping[str, Any]]
-"""Sends a `guide.*` command with its arguments; returns the guide's state."""
+"""Sends a `guide.*` command with its arguments, and returns the guide's state."""
 
 
 def plan_rows(path: Path) -> list[dict[str, Any]]:
-    """Read a plan as `rigcal plan --out` writes it, for `guide.start`.
+    """Read a plan in the format of `rigcal plan --out`, for `guide.start`.
 
     Raises:
-        CommandError: the file cannot be read, or a cell is no number.
+        CommandError: the file cannot be read, or a cell is not a number.
     """
     rows: list[dict[str, Any]] = []
     try:
@@ -50,7 +50,7 @@ def plan_rows(path: Path) -> list[dict[str, Any]]:
     except (csv.Error, UnicodeDecodeError) as error:
         raise CommandError(f"{path}: {error}", WRONG_USE) from None
     if not rows:
-        raise CommandError(f"{path}: no poses; `rigcal plan --out CSV` writes a plan", WRONG_USE)
+        raise CommandError(f"{path}: contains no poses; `rigcal plan --out CSV` writes a plan", WRONG_USE)
     return rows
 
 
@@ -58,7 +58,7 @@ def plan_rows(path: Path) -> list[dict[str, Any]]:
 
 
 def lead(say: Say) -> Mapping[str, Any]:
-    """Show step after step until the guide is over, and do what keys say; returns the last state.
+    """Show each step until the guide is over, and obey keys; return the last state.
 
     Ctrl-C leaves the guide open.
     """
@@ -73,7 +73,7 @@ def lead(say: Say) -> Mapping[str, Any]:
 
 
 def _lead_in_lines(say: Say) -> Mapping[str, Any]:
-    """Print a line for every step, its targets and every message, once; a message again after another one."""
+    """Print each step, its targets and its messages once; print a message again if it returns after a different one."""
     told: list[str] = []
     warned: list[str] = []
     while True:
@@ -92,7 +92,7 @@ def _lead_in_lines(say: Say) -> Mapping[str, Any]:
 
 
 def _lead_watched(say: Say) -> Mapping[str, Any]:
-    """Redraw the present step five times a second."""
+    """Redraw the current step five times a second."""
     note = ""
     begin_screen()
     try:
@@ -101,7 +101,7 @@ def _lead_watched(say: Say) -> Mapping[str, Any]:
                 guide = _guide(say("guide.state"))
                 columns, rows = shutil.get_terminal_size()
                 lines = [*screen(guide, columns), *([note] if note else [])]
-                hidden = max(0, len(lines) - rows + 1)  # in the middle: the step is at the top, the keys below
+                hidden = max(0, len(lines) - rows + 1)  # in the middle, as the step is at the top and the keys below
                 draw_screen([(line, {}) for line in (*lines[: len(lines) - hidden - 2], *lines[-2:])])
                 if guide["state"] != "open":
                     break
@@ -116,7 +116,7 @@ def _lead_watched(say: Say) -> Mapping[str, Any]:
 
 
 def _obey(pressed: str, step: Mapping[str, Any], say: Say) -> str:
-    """Do what a key says; returns what there is to tell."""
+    """Carry out a key's command; return a note for the operator, "" for none."""
     try:
         if pressed in "\r\n d":
             say("guide.done", step=step["id"])
@@ -138,7 +138,7 @@ def _with_reason(say: Say, step: Mapping[str, Any], *, rest: bool) -> str:
     with _line_mode(), contextlib.suppress(click.Abort):
         reason = click.prompt("why", default="", show_default=False)
     if not reason.strip():
-        return "nothing was skipped: a reason is needed"
+        return "nothing was skipped: give a reason"
     say("guide.skip", step=step["id"], reason=reason, rest=rest)
     return ""
 
@@ -147,7 +147,7 @@ def _with_reason(say: Say, step: Mapping[str, Any], *, rest: bool) -> str:
 
 
 def screen(guide: Mapping[str, Any], width: int) -> list[str]:
-    """Return the lines of a guide's present step, wrapped to the terminal's width."""
+    """Return the lines of a guide's current step, wrapped to the terminal's width in columns."""
     step = guide["step"]
     lines = [f"Guide {guide['id']}, step {step['number']} of {step['of']}: {step['title']}", step["instruction"]]
     lines.append(step["why"])
@@ -161,7 +161,7 @@ def screen(guide: Mapping[str, Any], width: int) -> list[str]:
 
 
 def _target_lines(guide: Mapping[str, Any]) -> list[str]:
-    """Return where the joints should be for the present pose, on one line; none at another step."""
+    """Return the target values of the joints for the current pose, on one line; none in a step without a pose."""
     if guide["hold"] is None:
         return []
     targets = (f"{joint['name']} {joint['target']:.1f} {joint['unit']}" for joint in guide["joints"])
@@ -216,7 +216,7 @@ def _keys_line(step: Mapping[str, Any]) -> str:
 
 
 def summary(state: Mapping[str, Any]) -> None:
-    """Print a state once."""
+    """Print the guide's state once."""
     guide = state["guide"]
     if guide is None:
         echo("no guide yet; `rigcal session guide --prisms w,b,r,s` starts one")
@@ -248,7 +248,7 @@ _saved: list[list[Any]] = []  # of the terminal, while keys are read one by one
 
 @contextlib.contextmanager
 def _keys() -> Iterator[Callable[[float], str]]:
-    """Read keys without waiting for Enter; yields what waits for one so long and returns it, "" where there is none."""
+    """Read keys without Enter; yield a function that waits up to a timeout for a key and returns it, "" for none."""
     import termios
     import tty
 
@@ -270,7 +270,7 @@ def _keys() -> Iterator[Callable[[float], str]]:
 
 @contextlib.contextmanager
 def _line_mode() -> Iterator[None]:
-    """Let a whole line be typed meanwhile."""
+    """Switch the terminal back to whole lines within the block."""
     import termios
     import tty
 
@@ -283,5 +283,5 @@ def _line_mode() -> Iterator[None]:
 
 
 def names(text: str | None) -> Sequence[str] | None:
-    """Return the names in a list with commas; None where none is given."""
+    """Return the names in a comma-separated list; None if `text` is None."""
     return None if text is None else [name.strip() for name in text.split(",") if name.strip()]

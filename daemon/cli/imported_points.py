@@ -1,4 +1,4 @@
-"""Points of an instrument's export as observations: each with its prism, its pose, and the joints of a second file."""
+"""Converts points of an instrument's export to observations, with prism, pose, and joint values of a second file."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ from drivers.stations.exports import export_formats
 from drivers.stations.tables.cells import cells_of, lines_of, number_of
 
 FILE_MAX_BYTES = 128 << 20
-REPEATED_MM = 10.0  # a point that is measured again is nearer to itself
-MOST_GAP_S = 1.0  # between the joint rows on both sides of a fix
+REPEATED_MM = 10.0  # repeated measurements of one point are closer to each other
+MOST_GAP_S = 1.0  # between the joint rows before and after a fix
 POSE, TIME_S, TIME = "pose", "time_s", "time"
 
 
 def read_export(path: Path) -> str:
-    """Return the text of an export: UTF-8, UTF-16 with its mark, or the Windows code page of western Europe.
+    """Return the text of an export: UTF-8, UTF-16 with a byte order mark, or Windows code page 1252.
 
     Raises:
-        DescriptionError: it cannot be read.
+        DescriptionError: the file cannot be read.
     """
     try:
         data = read_whole(path, FILE_MAX_BYTES)
@@ -49,10 +49,10 @@ def read_export(path: Path) -> str:
 
 
 def read_map(path: Path) -> ColumnMap:
-    """Read a map that an import has written, or a person.
+    """Read a map that an import or a person has written.
 
     Raises:
-        DescriptionError: it cannot be read, or a key of it is wrong.
+        DescriptionError: the file cannot be read, or one of its keys is wrong.
     """
     try:
         found = ColumnMap.model_validate(parse_toml(read_whole(path, 1 << 20).decode("utf-8-sig")))
@@ -61,7 +61,7 @@ def read_map(path: Path) -> ColumnMap:
     except ValidationError as error:
         first = error.errors()[0]
         raise DescriptionError(str(path), f"{'.'.join(map(str, place(first)))}: {reason(first, ColumnMap)}") from error
-    except ValueError as error:  # no TOML, no UTF-8
+    except ValueError as error:  # not TOML or not UTF-8
         raise DescriptionError(str(path), f"is not a TOML file: {error}") from error
     if found.format not in export_formats():
         raise DescriptionError(str(path), f"format: {found.format!r} is unknown; known: {', '.join(export_formats())}")
@@ -69,9 +69,14 @@ def read_map(path: Path) -> ColumnMap:
 
 
 def map_text(columns: ColumnMap, source: str) -> str:
-    """Return a map as TOML."""
+    """Return a map as TOML.
+
+    Args:
+        columns: the map.
+        source: name of the file that it was made for.
+    """
     told = columns.model_dump(exclude_defaults=True)
-    lines = [f"# How `rigcal import` read {quoted(source)}. Edit it, and give it with --map."]
+    lines = [f"# How `rigcal import` read {quoted(source)}. Edit this file, then use it with --map."]
     lines += [f"{key} = {_toml(value)}" for key, value in told.items() if not isinstance(value, dict)]
     for section in ("columns", "prisms"):
         if told.get(section):
@@ -92,12 +97,12 @@ class JointRows:
 
     Attributes:
         source: name of the file.
-        columns: columns that go into the observations.
-        by_pose: pose -> values, where the file has poses.
-        times_s: of the rows, rising; empty where the file has no times.
-        rows: values of each row.
-        max_rates: of the columns in deg/s for joints that turn; None for those that slide.
-        has_zone: whether the times are of a named time zone; None where they are no dates.
+        columns: columns to add to the observations.
+        by_pose: pose -> joint values; empty if the file has no poses.
+        times_s: ascending times of the rows, in seconds; empty if the file has no times.
+        rows: joint values of each row, in the order of `times_s`.
+        max_rates: for each column the largest rate of a revolute joint, deg/s; None for a prismatic joint.
+        has_zone: whether the times have a time zone; None if they are not dates.
     """
 
     source: str
@@ -109,31 +114,35 @@ class JointRows:
     has_zone: bool | None = None
 
     def of(self, fix: ExportedFix, source: str) -> Sequence[float]:
-        """Return the joint values of a fix: those of its pose, or between the rows before and after its time.
+        """Return the joint values of a fix: those of its pose, or interpolated to its time.
+
+        Args:
+            fix: the fix.
+            source: name of its file, for error messages.
 
         Raises:
-            DescriptionError: there are none; with the line of the fix.
+            DescriptionError: there are no joint values; the error has the line of the fix.
         """
         if self.by_pose:
             if fix.is_numbered:
-                said = f"the point has no name of its own, and {self.source} matches joint values by {POSE!r}"
-                refuse(source, f"{said}; call the column of names 'point', or name it in [columns] of a map", fix.line)
+                said = f"the point has no name, but {self.source} has joint values by {POSE!r}"
+                refuse(source, f"{said}; name the column of names 'point', or give it in [columns] of a map", fix.line)
             found = self.by_pose.get(_plain(fix.point))
             if found is None:
                 refuse(source, f"{self.source} has no pose {fix.point!r}", fix.line)
             return found
         if fix.time_s is None:
-            refuse(source, f"the point has no time, and {self.source} no column {POSE!r} to match it by", fix.line)
+            refuse(source, f"the point has no time, and {self.source} has no column {POSE!r} to match it by", fix.line)
         if self.has_zone is not None and fix.has_zone is (not self.has_zone):
             zoned, bare = (self.source, source) if self.has_zone else (source, self.source)
-            said = f"times of {zoned} have a time zone, and those of {bare} none, so they may differ by hours"
+            said = f"times of {zoned} have a time zone but times of {bare} do not, so they may differ by hours"
             refuse(source, f"{said}; write both in UTC with a Z at the end (2026-11-24T10:00:00Z)", fix.line)
         place = bisect_left(self.times_s, fix.time_s)
         if place < len(self.times_s) and self.times_s[place] == fix.time_s:
             return self.rows[place]
         if not 0 < place < len(self.times_s) or self.times_s[place] - self.times_s[place - 1] > MOST_GAP_S:
             span = f"{self.times_s[0]:.3f} to {self.times_s[-1]:.3f} s"
-            reason = f"{self.source} has no joints within {MOST_GAP_S:g} s on both sides of {fix.time_s:.3f} s ({span})"
+            reason = f"{self.source} has no rows at most {MOST_GAP_S:g} s apart around {fix.time_s:.3f} s ({span})"
             refuse(source, reason, fix.line)
         before, after = self.times_s[place - 1], self.times_s[place]
         share = (fix.time_s - before) / (after - before)
@@ -145,8 +154,8 @@ def read_joints(path: Path, rig: Rig) -> JointRows:
     """Read a file of joint values: a column for each joint as in observations, and `pose`, `time_s` or `time` (ISO).
 
     Raises:
-        DescriptionError: a column is missing, a cell is no number, or a pose or a time is there twice; with line
-            and column.
+        DescriptionError: a column is missing, a cell is not a number, or a pose or a time is repeated; the error has
+            line and column.
     """
     source = path.name
     lines = lines_of(read_export(path))
@@ -156,7 +165,7 @@ def read_joints(path: Path, rig: Rig) -> JointRows:
     key = next((name for name in (POSE, TIME_S, TIME) if name in header), None)
     if key is None:
         refuse(
-            source, f"needs a column {POSE!r} (the point's name or number), {TIME_S!r} or {TIME!r} to match fixes by", 1
+            source, f"needs a column {POSE!r} (name or number of the point), {TIME_S!r} or {TIME!r} to match fixes", 1
         )
     by_pose: dict[str, list[float]] = {}
     timed: dict[float, tuple[int, list[float]]] = {}
@@ -166,7 +175,7 @@ def read_joints(path: Path, rig: Rig) -> JointRows:
             continue
         cells = cells_of(line, ",")
         if len(cells) != len(header):
-            refuse(source, f"{len(cells)} cells where the header has {len(header)}", number)
+            refuse(source, f"has {len(cells)} cells, but the header has {len(header)}", number)
         row = []
         for column in joints:
             value = number_of(cells[header.index(column)], ".")
@@ -176,17 +185,17 @@ def read_joints(path: Path, rig: Rig) -> JointRows:
         cell = cells[header.index(key)]
         if key == POSE:
             if by_pose.setdefault(_plain(cell), row) is not row:
-                refuse(source, f"pose {cell!r} is there twice", number, POSE)
+                refuse(source, f"pose {cell!r} is repeated", number, POSE)
         else:
             time_s, has_zone = _seconds(cell, source, number, key)
             zones |= set() if has_zone is None else {has_zone}
             if len(zones) > 1:
-                refuse(source, f"{cell!r}: some times have a time zone, and others none; write all in UTC", number, key)
+                refuse(source, f"{cell!r}: some times have a time zone and some do not; write all in UTC", number, key)
             before, same = timed.setdefault(time_s, (number, row))
             if same != row:
-                refuse(source, f"time {cell!r} is in line {before} with other joint values; leave one", number, key)
+                refuse(source, f"time {cell!r} is in line {before} with different joint values; keep one", number, key)
     if not by_pose and not timed:
-        refuse(source, "no rows below the header")
+        refuse(source, "has no rows below the header")
     times = sorted(timed)
     rates = [joint.max_rate if joint.kind == "revolute" else None for joint in rig.joints]
     return JointRows(source, joints, by_pose, times, [timed[at][1] for at in times], rates, next(iter(zones), None))
@@ -194,17 +203,15 @@ def read_joints(path: Path, rig: Rig) -> JointRows:
 
 def _check_joint_columns(header: Sequence[str], joints: Sequence[str], rig: Rig, source: str) -> None:
     if len(header) == 1:
-        refuse(source, "one column only: separate columns by commas, and write decimals with a point", 1)
+        refuse(source, "has only one column: separate columns with commas, and use a decimal point", 1)
     for column in joints:
         if header.count(column) != 1:
-            problem = (
-                "is there twice" if column in header else f"is missing; rig {rig.name!r} needs {', '.join(joints)}"
-            )
+            problem = "is repeated" if column in header else f"is missing; rig {rig.name!r} needs {', '.join(joints)}"
             refuse(source, f"the column {problem}", 1, column)
 
 
 def _step(value: float, following: float, seconds: float, max_rate: float | None) -> float:
-    """Return how far a joint has moved; one that would have turned too fast is read on another turn, as 359 and 1."""
+    """Return a joint's motion between two rows; if its rate is too high, assume a wrap by 360 deg, as from 359 to 1."""
     step = following - value
     if max_rate is None or abs(step) <= max_rate * seconds:
         return step
@@ -212,7 +219,7 @@ def _step(value: float, following: float, seconds: float, max_rate: float | None
 
 
 def _seconds(cell: str, source: str, line: int, column: str) -> tuple[float, bool | None]:
-    """Return the seconds of a cell, and whether they are of a named time zone; None where it has no date."""
+    """Return the time in a cell in seconds, and whether it has a time zone; None if it is not a date."""
     value = number_of(cell, ".")
     if value is not None:
         return value, None
@@ -224,12 +231,12 @@ def _seconds(cell: str, source: str, line: int, column: str) -> tuple[float, boo
 
 
 def _plain(pose: str) -> str:
-    """Return a pose's number without leading zeros, which memories of stations add."""
+    """Return a pose's number without leading zeros, which stations add in their memory."""
     return pose.lstrip("0") or "0" if pose.isdigit() else pose
 
 
 def far_repetitions(fixes: Sequence[ExportedFix], source: str) -> tuple[str, ...]:
-    """Return a note on points that are there twice in different places; most likely one of them is another pose."""
+    """Return a note on repeated points at different positions; probably they were measured in different poses."""
     first: dict[tuple[str, str, str], ExportedFix] = {}
     found = []
     for fix in fixes:
@@ -240,21 +247,21 @@ def far_repetitions(fixes: Sequence[ExportedFix], source: str) -> tuple[str, ...
     if not found:
         return ()
     more = f" and {len(found) - 3} more" if len(found) > 3 else ""
-    return (f"{source} has points twice in different places: {'; '.join(found[:3])}{more}; both are taken",)
+    return (f"{source} has repeated points at different positions: {'; '.join(found[:3])}{more}; all are used",)
 
 
 def several_constants(fixes: Sequence[ExportedFix], prisms: Sequence[str], source: str) -> tuple[str, ...]:
     """Return a note on each prism that one station measured with several prism constants.
 
     Args:
-        fixes: as the file has them.
-        prisms: of the fixes, as the rows have them.
+        fixes: in the order of the file.
+        prisms: prism of each fix.
         source: name of the file.
     """
     first: dict[tuple[str, str], dict[float, ExportedFix]] = {}
     for fix, prism in zip(fixes, prisms, strict=True):
         if fix.prism_constant_mm is not None:
-            constant_mm = round(fix.prism_constant_mm, 1) + 0.0  # stations have it in steps of 0.1 mm; no -0
+            constant_mm = round(fix.prism_constant_mm, 1) + 0.0  # stations resolve 0.1 mm; + 0.0 avoids -0
             first.setdefault((prism, fix.station), {}).setdefault(constant_mm, fix)
     notes = []
     for (prism, station), constants in first.items():
@@ -262,18 +269,18 @@ def several_constants(fixes: Sequence[ExportedFix], prisms: Sequence[str], sourc
             at = f" at {station!r}" if station else ""
             said = [f"{mm:g} mm (from point {fix.point!r}, line {fix.line})" for mm, fix in constants.items()]
             notes.append(
-                f"{source} has prism {prism!r}{at} measured with prism constants of {' and '.join(said)}, by which its "
-                "distances differ: leave out the points with the wrong one, or give each prism a name of its own"
+                f"{source} has prism {prism!r}{at} measured with prism constants of {' and '.join(said)}, so its "
+                "distances are inconsistent: remove the points with the wrong constant, or name the prisms differently"
             )
     return tuple(notes)
 
 
 def setup_names(fixes: Sequence[ExportedFix], setup: str) -> dict[str, str]:
-    """Return station of the file -> set-up of its rows; every station has one of its own where the file has several.
+    """Return station of the file -> set-up of its rows; if the file has several stations, each has its own set-up.
 
     Args:
-        fixes: as the file has them.
-        setup: as it was named for all rows; "" where it was not.
+        fixes: in the order of the file.
+        setup: name given for all rows; "" if none was given.
     """
     stations = list(dict.fromkeys(fix.station for fix in fixes))
     if len(stations) == 1:
@@ -284,17 +291,17 @@ def setup_names(fixes: Sequence[ExportedFix], setup: str) -> dict[str, str]:
 
 
 def several_setups(setups: Mapping[str, str], source: str) -> tuple[str, ...]:
-    """Return a note on a file of several stations."""
+    """Return a note on a file with several stations."""
     if len(setups) < 2:
         return ()
     return (
-        f"{source} has {len(setups)} set-ups of the instrument, and so have the rows: {', '.join(setups.values())}; "
-        "each has a frame of its own",
+        f"{source} has {len(setups)} set-ups of the instrument, which the rows have too: "
+        f"{', '.join(setups.values())}; each has its own frame",
     )
 
 
 def repeated_setups(fixes: Sequence[ExportedFix], source: str) -> tuple[str, ...]:
-    """Return a note on an instrument that is set up again under the name of a set-up before."""
+    """Return a note on an instrument that is set up again under the name of an earlier set-up."""
     first: dict[str, int] = {}
     lines: dict[int, tuple[int, str]] = {}
     for fix in fixes:
@@ -305,27 +312,27 @@ def repeated_setups(fixes: Sequence[ExportedFix], source: str) -> tuple[str, ...
     again = [f"before line {line} as {station or 'unnamed'!r}" for line, station in lines.values()]
     more = f" and {len(again) - 3} times more" if len(again) > 3 else ""
     return (
-        f"{source} sets the instrument up again under a name it had before: {'; '.join(again[:3])}{more}; its points "
-        "are taken as of one set-up: give the file in parts if it stood elsewhere or was turned",
+        f"{source} sets the instrument up again under an earlier name: {'; '.join(again[:3])}{more}; all its points "
+        "are assigned to one set-up: split the file if the instrument was moved or turned",
     )
 
 
 def bare_times(fixes: Sequence[ExportedFix], joints: JointRows | None, source: str) -> tuple[str, ...]:
-    """Return a note on dates without a time zone: UTC is taken."""
+    """Return a note on dates without a time zone, which are taken as UTC."""
     bare = [source] * any(fix.has_zone is False for fix in fixes)
     bare += [joints.source] if joints is not None and joints.has_zone is False else []
-    return (f"times of {' and '.join(bare)} have no time zone, and are taken for UTC",) if bare else ()
+    return (f"times of {' and '.join(bare)} have no time zone and are taken as UTC",) if bare else ()
 
 
 def target_heights(fixes: Sequence[ExportedFix], source: str) -> tuple[str, ...]:
-    """Return a note on coordinates of places below the prism."""
-    height_mm = fixes[0].target_height_mm  # a table in which they differ is refused
+    """Return a note on coordinates that may refer to points below the prism."""
+    height_mm = fixes[0].target_height_mm  # a table with different heights is refused
     if not height_mm:
         return ()
     said = (
-        f"{source} has target heights of {height_mm:g} mm, so its coordinates may be of places as far below the prism"
+        f"{source} has target heights of {height_mm:g} mm, so its coordinates may be of points that far below the prism"
     )
-    return (f"{said}; they are taken as they are: export with heights of 0 where that matters",)
+    return (f"{said}; they are used unchanged: if that is wrong, export with target heights of 0",)
 
 
 # ---- observations ----------------------------------------------------------------------------------------------------
@@ -342,15 +349,15 @@ def observations_csv(
     """Return the observations CSV of an export's fixes.
 
     Args:
-        fixes: as the file has them.
-        prisms: of the fixes.
+        fixes: in the order of the file.
+        prisms: prism of each fix.
         source: name of the file.
-        joints: their joint values; none when None.
+        joints: rows of joint values; None to write no joint columns.
         setups: station of the file -> set-up.
-        session: of all rows; "" for none.
+        session: name for all rows; "" for none.
 
     Raises:
-        DescriptionError: a fix has no joint values; with its line.
+        DescriptionError: a fix has no joint values; the error has its line.
     """
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
@@ -374,20 +381,20 @@ def prisms_of(
     """Return the prism of each fix.
 
     Args:
-        fixes: as the file has them.
-        columns: its map, which may name prisms.
+        fixes: in the order of the file.
+        columns: map of the file, which may name prisms.
         source: name of the file.
-        rig: whose prisms are measured; any name is taken when None.
-        prism: of all fixes; by the file and the map when None.
+        rig: the rig whose prisms are measured; None to accept any name.
+        prism: the prism of all fixes; None to use the file and the map.
 
     Raises:
-        DescriptionError: a fix's prism is not known; with its line.
+        DescriptionError: a fix's prism is unknown; the error has its line.
     """
     return [prism or _prism(fix, columns, source, rig) for fix in fixes]
 
 
 def _prism(fix: ExportedFix, columns: ColumnMap, source: str, rig: Rig | None) -> str:
-    """Return a fix's prism: what the map says of its target or point, else the target itself, else the only prism."""
+    """Return a fix's prism: from the map by its target or point, else its target, else the rig's only prism."""
     found = columns.prisms.get(fix.target) or columns.prisms.get(fix.point) or fix.target
     if rig is None:
         return found or "prism"
@@ -396,5 +403,5 @@ def _prism(fix: ExportedFix, columns: ColumnMap, source: str, rig: Rig | None) -
     if len(rig.prism_names) == 1 and not fix.target:
         return rig.prism_names[0]
     said = f"{fix.target!r}" if fix.target else "no code"
-    reason = f"point {fix.point!r} has {said}, which is no prism of rig {rig.name!r} ({', '.join(rig.prism_names)}); "
-    refuse(source, f"{reason}give --prism, or name it in [prisms] of the map", fix.line)
+    reason = f"point {fix.point!r} has {said}, which is not a prism of rig {rig.name!r} ({', '.join(rig.prism_names)})"
+    refuse(source, f"{reason}; give --prism, or assign it in [prisms] of the map", fix.line)

@@ -1,4 +1,4 @@
-"""Listens to a CAN bus and to serial ports, and sends nothing: what `rigcal init` and an operator can learn so."""
+"""Listens to a CAN bus and to serial ports without sending, for `rigcal init`."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from drivers.stations.profiles import codecs_by_family
 from drivers.stations.serial_port import SerialConfig, SerialPort
 
 _WAIT_S = 0.1
-_OF_NODES = (Service.HEARTBEAT, Service.TPDO, Service.EMCY, Service.SDO_RESPONSE)  # what nodes send
-BAUDS = (9600, 19200, 38400, 4800, 2400, 1200, 57600, 115200)  # the instruments' usual ones first
+_OF_NODES = (Service.HEARTBEAT, Service.TPDO, Service.EMCY, Service.SDO_RESPONSE)  # services that nodes send
+BAUDS = (9600, 19200, 38400, 4800, 2400, 1200, 57600, 115200)  # the most common first
 FORMATS = ((8, "none"), (7, "even"))
 
 
 @dataclass(frozen=True)
 class HeardBus:
-    """Frames that were heard on a CAN bus.
+    """Frames received from a CAN bus.
 
     Attributes:
         identifiers: 11-bit or 29-bit identifier -> number of frames.
-        nodes: CANopen nodes that sent a heartbeat, a process data object or an emergency, in their order.
+        nodes: sorted CANopen nodes that sent a heartbeat, a process data object, an emergency or an SDO response.
     """
 
     identifiers: dict[int, int]
@@ -37,12 +37,12 @@ class HeardBus:
 
 @dataclass(frozen=True)
 class HeardStation:
-    """A serial port on which sound records of a total station were heard.
+    """A serial port on which valid records of a total station were received.
 
     Attributes:
         serial: the port and its settings.
-        family: protocol of the records, as `listen_to` has it.
-        records: how many.
+        family: protocol of the records, as in the configuration key `listen_to`.
+        records: number of records.
     """
 
     serial: SerialConfig
@@ -51,14 +51,19 @@ class HeardStation:
 
 
 def hear_bus(config: CanLinkConfig, seconds: float, clock: Clock) -> HeardBus:
-    """Listen to a bus for some seconds.
+    """Listen to a bus.
+
+    Args:
+        config: of the link; it must not allow transmission.
+        seconds: how long to listen.
+        clock: measures the time.
 
     Raises:
-        LinkError: it cannot be opened, or was lost.
-        ValueError: the configuration would allow to transmit.
+        LinkError: the bus cannot be opened, or was lost.
+        ValueError: the configuration allows transmission.
     """
     if config.allow_transmit or config.sync_period_ms is not None:
-        raise ValueError("a bus is listened to without a right to transmit")
+        raise ValueError("the configuration of a bus to listen to must not allow transmission")
     counts: Counter[int] = Counter()
     nodes: set[int] = set()
     until_ns = clock.monotonic_ns() + round(seconds * NS_PER_S)
@@ -78,7 +83,7 @@ def hear_bus(config: CanLinkConfig, seconds: float, clock: Clock) -> HeardBus:
 
 
 def serial_ports() -> list[str]:
-    """Return the serial adapters that are plugged in, by the names that stay theirs where there are any."""
+    """Return the plugged-in serial adapters, by persistent names where they exist."""
     named = sorted(str(path) for path in Path("/dev/serial/by-id").glob("*"))
     rule = [str(path) for path in (Path("/dev/rigcal-station"),) if path.exists()]
     found = rule + named
@@ -88,18 +93,18 @@ def serial_ports() -> list[str]:
 
 
 def hear_station(path: str, seconds: float, clock: Clock, bauds: Sequence[int] = BAUDS) -> HeardStation | None:
-    """Listen to a serial port with each baud and format for some seconds, until sound records are heard.
+    """Listen to a serial port with each baud and format until valid records are received.
 
-    An instrument that answers only when it is asked is not heard.
+    An instrument that sends only on request cannot be detected.
 
     Args:
         path: of the port.
-        seconds: for each baud and format.
-        clock: stamps what is received.
-        bauds: to try.
+        seconds: how long to listen with each baud and format.
+        clock: stamps the received data.
+        bauds: bauds to try, in this order.
 
     Returns:
-        The first setting under which records are sound; None where there is none.
+        The first setting that gives valid records; None if there is none.
 
     Raises:
         LinkError: the port cannot be opened, or was lost.

@@ -1,4 +1,4 @@
-"""Captured logs through decoders and session into a store of their own, as fast as it goes."""
+"""Replays captured logs through decoders and a session into a separate store, at full speed."""
 
 from __future__ import annotations
 
@@ -26,12 +26,17 @@ from drivers.readings import Capture, DeviceEvent
 
 REPLAYED = "replayed"
 
-# UTC of an operator's command, and the command.
+# Time of an operator's command (UTC, ns), and the command.
 Commands = deque[tuple[int, Callable[[], object]]]
 
 
 def whole_session(prism: str, kind: str) -> SessionFile:
-    """Return a session on one prism that holds every capture."""
+    """Return a session on one prism that spans all captures.
+
+    Args:
+        prism: name of the prism.
+        kind: one of `SESSION_KINDS`.
+    """
     return SessionFile(prism=prism, kind=kind, since_utc_ns=0, until_utc_ns=LATEST_UTC_NS, control_points={})
 
 
@@ -42,19 +47,19 @@ def replay_logs(
 
     Args:
         files: the logs.
-        settings: configuration that the logs are of.
-        source: rig that the logs are of.
+        settings: configuration with which the logs were captured.
+        source: rig from which the logs were captured.
         path: the new store.
         told: the session that the fixes belong to; None for no session.
 
     Returns:
-        The closed session, as `session.list` tells it; None where there is none.
+        The closed session, as in `session.list`; None if there is none.
 
     Raises:
         DescriptionError, ConfigError: a log is malformed, empty, or of a link that is not configured.
         StoreError: the store cannot be written.
     """
-    starts = first_captures(files, settings, told)  # a bad log is refused before a store is made
+    starts = first_captures(files, settings, told)  # refuses a bad log before the store is created
     clock = ManualClock()
     clock.set(min((capture.stamp for capture in starts.values()), key=lambda stamp: stamp.monotonic_ns))
     source, read = with_files(source)
@@ -82,7 +87,7 @@ def replay_logs(
             store.insert_records([_event_of(state) for state in told.device_states])
         acquisition = Acquisition((), made, store, clock, on_records=sessions.on_records)
         acquisition.run_inline(_followed(merged(files, settings, told), clock, commands))
-        for _, command in commands:  # those after the last capture
+        for _, command in commands:  # commands after the last capture
             command()
         return sessions.list_command({})[0] if told is not None else None
 
@@ -92,7 +97,7 @@ def _event_of(state: DeviceState) -> DeviceEvent:
 
 
 def _commands_of(told: SessionFile, sessions: SessionManager, begin_ns: int) -> Commands:
-    """Return the operator's commands of a session in the order of their instants."""
+    """Return the operator's commands of a session in the order of time."""
     start = {"id": REPLAYED, "prism": told.prism, "kind": told.kind, "operator": "replay"}
     confirm = partial(sessions.confirm_prism_command, {"operator": "replay"})
     between = [(at_ns, confirm) for at_ns in told.prism_confirmed_utc_ns]
@@ -107,7 +112,7 @@ def _commands_of(told: SessionFile, sessions: SessionManager, begin_ns: int) -> 
 
 
 def _followed(captures: Iterable[Capture], clock: ManualClock, commands: Commands) -> Iterator[Capture]:
-    """Pass captures on; each one's instant is set on the clock, and due commands run before it."""
+    """Yield captures; before each one, run the commands that are due and set the clock to its time."""
     for capture in captures:
         while commands and commands[0][0] <= capture.stamp.monotonic_ns:
             at_ns, command = commands.popleft()

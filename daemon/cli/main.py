@@ -1,8 +1,8 @@
-"""`rigcal`: finds its commands in their folder, one file each.
+"""`rigcal`: finds its commands in the folder `commands`, one file each.
 
-`commands/NAME.py` defines the command or group NAME as a function of that name. A module is imported for its help or
-when its command is used, so at its top level it imports nothing heavy. A name that Python keeps for itself has an
-underscore at its end there (`import_.py`).
+`commands/NAME.py` defines the command or group NAME as a function of that name. A module is imported to show its help
+or run its command, so at its top level it imports nothing heavy. For a name that is a Python keyword, file and function
+have a trailing underscore (`import_.py`).
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class _Commands(click.Group):
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        """As click does, which suggests commands of a group only where they are loaded already."""
+        """Resolve as click does, and suggest similar commands, which click does only for loaded commands."""
         try:
             return super().resolve_command(ctx, args)
         except click.UsageError as error:
@@ -48,7 +48,7 @@ class _Commands(click.Group):
 @click.group(cls=_Commands, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(VERSION, prog_name="rigcal")
 def main() -> None:
-    """Make a drilling boom's kinematic model true."""
+    """Calibrate the kinematic model of a drilling boom."""
 
 
 if __name__ == "__main__":

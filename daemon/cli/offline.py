@@ -1,4 +1,4 @@
-"""The offline commands' common parts: options, observations in, results out."""
+"""Common parts of the offline commands: options, reading observations, writing results."""
 
 from __future__ import annotations
 
@@ -29,18 +29,18 @@ DIRECTORY = click.Path(path_type=Path)
 
 class _Finite:
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        number = super().convert(value, param, ctx)  # type: ignore[misc]  # of the click type beside
+        number = super().convert(value, param, ctx)  # type: ignore[misc]  # of the other base class
         if not math.isfinite(number):
             self.fail(f"{value!r} is not a finite number.", param, ctx)  # type: ignore[attr-defined]
         return number
 
 
 class FiniteNumber(_Finite, click.types.FloatParamType):
-    """A number; "nan" and "inf" are none."""
+    """A number; "nan" and "inf" are refused."""
 
 
 class FiniteRange(_Finite, click.FloatRange):
-    """A range of numbers; "nan" is in none, though it is neither below nor above anything."""
+    """A range of numbers; refuses "nan", which passes comparisons with the limits."""
 
 
 ABOVE_0 = FiniteRange(min=0, min_open=True)
@@ -51,42 +51,45 @@ signal_option = click.option(
     "signals",
     multiple=True,
     metavar="COLUMN",
-    help="Use a further column of numbers, as a [[signal]] of the rig file does: NAME_UNIT, or NAME without a unit "
-    "(tilt_x_deg, oil_degC). May be given again; the model remembers it.",
+    help="Also use this column of numbers, like a [[signal]] of the rig file: NAME_UNIT, or NAME without a unit "
+    "(tilt_x_deg, oil_degC). May be repeated; stored with the model.",
 )
 model_option = click.option(
-    "--model", "directory", type=DIRECTORY, required=True, metavar="DIR", help="The directory calibrate wrote."
+    "--model",
+    "directory",
+    type=DIRECTORY,
+    required=True,
+    metavar="DIR",
+    help="Directory of a model, as written by `rigcal calibrate`.",
 )
 prior_option = click.option(
     "--prior",
     type=click.Choice(("recalibration", "as-built")),
     default="recalibration",
     show_default=True,
-    help="Trust the rig's build tolerances, or estimate from the data how far off the drawings are.",
+    help="Trust the rig's build tolerances, or estimate from the data how far the machine deviates from the drawings.",
 )
 seed_option = click.option(
-    "--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Seed of every random choice."
+    "--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Seed of all random choices."
 )
-csv_out_option = click.option(
-    "--out", type=DIRECTORY, metavar="CSV", help="Where to write; standard output by default."
-)
+csv_out_option = click.option("--out", type=DIRECTORY, metavar="CSV", help="File to write; standard output by default.")
 tolerance_option = click.option(
     "--tolerance",
     "tolerance_mm",
     type=ABOVE_0,
     metavar="MM",
-    help="Root mean square error that the machine may have: say whether it passed. Fixes that were fitted cannot pass.",
+    help="Report whether the root mean square error is within this tolerance in mm. Only held-out fixes can pass.",
 )
 time_limit_option = click.option(
     "--time-limit",
     type=ABOVE_0,
     metavar="SECONDS",
-    help="End each global search after this time, and go on with the best until then.",
+    help="End each global search after this many seconds, and continue with its best result. No limit by default.",
 )
 
 
 class Stopwatch:
-    """The time that a command takes, from now on."""
+    """Measures the duration of a command, from its creation."""
 
     def __init__(self) -> None:
         self._clock = SystemClock()
@@ -94,12 +97,12 @@ class Stopwatch:
 
     @property
     def seconds(self) -> float:
-        """Seconds since it was made."""
+        """Seconds since its creation."""
         return round((self._clock.monotonic_ns() - self._started_ns) / NS_PER_S, 3)
 
     @property
     def utc_ns(self) -> int:
-        """The present instant."""
+        """The current time."""
         return self._clock.now().utc_ns
 
 
@@ -108,6 +111,11 @@ class Stopwatch:
 
 def read_observations(path: Path, rig: Rig, *, positions_required: bool = True) -> tuple[Observations, bytes]:
     """Read an observations CSV; return the table and the file's bytes.
+
+    Args:
+        path: of the file.
+        rig: the rig that was measured.
+        positions_required: whether the file must have positions.
 
     Raises:
         DataError: the file cannot be read or does not fit the rig.
@@ -124,12 +132,12 @@ def read_observations(path: Path, rig: Rig, *, positions_required: bool = True) 
 
 
 def require_columns(observations: Observations, columns: Sequence[str], path: Path) -> None:
-    """DataError unless the observations have all of these optional columns, which were asked for by name."""
+    """Raise DataError if the observations lack one of the optional columns that were requested with --signal."""
     from calibration.errors import DataError
 
     for column in columns:
         if column not in observations.extra:
-            raise DataError(path.name, "the file has no such column, which --signal names", column=column)
+            raise DataError(path.name, "the file has no such column, although --signal names it", column=column)
 
 
 def source_line(path: Path, data: bytes) -> str:
@@ -143,18 +151,18 @@ def source_line(path: Path, data: bytes) -> str:
 
 
 def check_out(out: Path | None, data: Path) -> None:
-    """Refuse to write a result over the data that it is made from."""
+    """Refuse to overwrite the data with the result."""
     if out is not None and out.exists() and out.samefile(data):
-        raise click.UsageError(f"{out} is the data itself; name another file with --out")
+        raise click.UsageError(f"{out} is the input file; name a different file with --out")
 
 
 def with_columns(raw: bytes, columns: Mapping[str, Floats], dropped: Collection[str] = ()) -> str:
-    """Return an observations CSV as it came, with some columns replaced and others added.
+    """Return an observations CSV unchanged except for replaced, added and dropped columns.
 
     Args:
         raw: the file's bytes, which `parse_observations` has read.
-        columns: name -> (n,) numbers, put in place of a column of that name or else after all others.
-        dropped: names of columns to leave out, where they are there.
+        columns: name -> (n,) numbers; they replace the column of that name or are added after all others.
+        dropped: names of columns to omit if they exist.
     """
     reader = csv.reader(io.StringIO(raw.decode("utf-8-sig"), newline=""), strict=True)
     header, *rows = [row for row in reader if row]
@@ -172,14 +180,14 @@ def with_columns(raw: bytes, columns: Mapping[str, Floats], dropped: Collection[
 
 
 def deliver(table: str, result: dict[str, object], warnings: Sequence[str], out: Path | None, *, as_json: bool) -> None:
-    """Give a table and warnings out: to the file, or into the JSON object as "csv", or to standard output.
+    """Write a table to the file, or put it into the JSON object as "csv", or print it; print the warnings.
 
     Args:
         table: the CSV.
-        result: the JSON object, which is told where the table is.
-        warnings: for people; in the object they are already.
-        out: the file, None for none.
-        as_json: True if standard output is the object's.
+        result: the JSON object, to which the table or the path of its file is added.
+        warnings: for people; the JSON object has them already.
+        out: the file; None for none.
+        as_json: True if standard output is for the JSON object.
     """
     if out is not None:
         write_file(out, table.encode("utf-8"))
@@ -193,7 +201,12 @@ def deliver(table: str, result: dict[str, object], warnings: Sequence[str], out:
 
 
 def show_stages(result: Mapping[str, Any], title: str) -> None:
-    """Print errors stage by stage, of all rows and of each prism's, from the result of an evaluation."""
+    """Print the errors of each stage, for all rows and for each prism.
+
+    Args:
+        result: JSON object of an evaluation.
+        title: of the table.
+    """
     from daemon.report.words import number
 
     figures = ("mean", "rms", "max", "std")
@@ -211,7 +224,7 @@ def show_evaluation(result: Mapping[str, Any], rows: str) -> None:
 
     Args:
         result: the JSON object (docs/reference/formats.md).
-        rows: the rows that the errors are of, e.g. "the 250 fixes it was fitted to".
+        rows: the rows that the errors refer to, e.g. "the 250 fixes it was fitted to".
     """
     from daemon.report.words import number
 
@@ -228,14 +241,14 @@ def show_evaluation(result: Mapping[str, Any], rows: str) -> None:
     covered = result["intervals"]
     axes = ", ".join(f"{share:.0%}" for share in covered["axis_coverage"])
     echo(
-        f"{covered['level']:.0%} intervals hold {axes} of the errors of x, y, z and {covered['radius_coverage']:.0%} "
-        "of the 3-D ones"
+        f"{covered['level']:.0%} intervals contain {axes} of the errors in x, y, z and "
+        f"{covered['radius_coverage']:.0%} of the 3-D errors"
     )
     expected = result["expected_accuracy"]
     if expected is not None:
         place = f" at set-up {expected['setup']!r}" if expected["setup"] else ""
         echo(
-            f"expected of the model itself over the work volume{place}: {number(expected['rms_mm'])} mm RMS, 95 % "
+            f"expected error of the model over the work volume{place}: {number(expected['rms_mm'])} mm RMS, 95 % "
             f"within {number(expected['p95_mm'])} mm, {expected['where']}"
         )
     if result["axes"]:
@@ -249,15 +262,15 @@ def show_evaluation(result: Mapping[str, Any], rows: str) -> None:
 def judged(
     result: dict[str, object], tolerance_mm: float | None, rms_mm: float, rows: str, *, is_held_out: bool, as_json: bool
 ) -> dict[str, object]:
-    """Return a result with the verdict on a tolerance, if one is stated; print it for people.
+    """Add the verdict on a tolerance to a result, if a tolerance is given; print it for people.
 
     Args:
         result: the JSON object.
-        tolerance_mm: root mean square error that the machine may have; None where none is stated.
-        rms_mm: the error.
-        rows: which fixes it is of.
-        is_held_out: the model was not fitted to them.
-        as_json: nothing is printed.
+        tolerance_mm: root mean square error that the machine may have; None if none is given.
+        rms_mm: root mean square error of the model.
+        rows: the fixes that the error refers to, in words.
+        is_held_out: whether the model was not fitted to these fixes.
+        as_json: True to print nothing.
     """
     from daemon.report.front import judge
 
@@ -270,13 +283,13 @@ def judged(
 
 
 def show_verdict(verdict: Verdict) -> None:
-    """Print the verdict on a tolerance, in its colour."""
+    """Print the verdict on a tolerance, in colour."""
     colour = {"passed": "green", "failed": "red", "not judged": "yellow"}[verdict.outcome]
     echo(verdict.sentence, fg=colour, bold=True)
 
 
 def _show_axes(axes: Sequence[Mapping[str, Any]]) -> None:
-    """Print, for each joint, the single-joint sweep that disagrees most with the model."""
+    """Print, for each joint, the single-joint sweep that deviates most from the model."""
     from daemon.report.words import number
 
     def chance(axis: Mapping[str, Any]) -> float:
@@ -299,7 +312,7 @@ def _show_axes(axes: Sequence[Mapping[str, Any]]) -> None:
     echo_table(
         ("joint", "prism", "angle, deg", "offset, mm", "by chance"),
         rows,
-        title="Axes of single-joint sweeps, measured against the model",
+        title="Axes of single-joint sweeps, deviation from the model",
         text_columns=(0, 1),
         bold=[bool(axis["sentence"]) for axis in worst],
     )

@@ -17,9 +17,10 @@ class JointChoice:
     """A joint of a new rig file.
 
     Attributes:
-        name, kind: revolute or prismatic.
-        limits: deg or mm.
-        node: CANopen node that reads it.
+        name: of the joint.
+        kind: revolute or prismatic.
+        limits: lowest and highest reading, deg or mm.
+        node: CANopen node of its encoder.
     """
 
     name: str
@@ -40,25 +41,25 @@ def configuration(
 
     Args:
         rig: name or file name of the rig.
-        interface: kind of CAN adapter, as python-can has it.
-        channel: of that adapter.
-        bitrate: bit/s; None where the system sets it.
-        station: profile, family to listen to and port of the total station; None without one.
+        interface: name of the python-can interface.
+        channel: of that interface.
+        bitrate: bit/s; None if the system sets it.
+        station: profile, family to listen to and port of the total station; None for no station.
     """
     rate = f"bitrate = {bitrate}\n" if bitrate is not None else ""
     text = f"""# The daemon's configuration. Check it after every change:  rigcal config check FILE
 # All keys: docs/reference/configuration.md. The package installs a configuration with an example of each table.
 
-# A rig that ships with rigcal (swdt82, ys100, ur10), or the path of a rig file, relative to this file.
+# Name of a shipped rig (swdt82, ys100, ur10), or path of a rig file relative to this file.
 rig = {quoted(rig)}
 
-# Where store, models and reports are kept; the service keeps them in /var/lib/rigcal where this is left out.
+# Directory of store, models and reports; the service's default is /var/lib/rigcal.
 # state_directory = "/var/lib/rigcal"
 
-# Members of this group may look and change nothing.
+# Members of this group have read-only access to the daemon.
 # read_group = "rigcal-read"
 
-# The boom's bus. rigcal sends nothing on it unless allow_transmit = true stands here, with the nodes it may set up.
+# The boom's bus. rigcal sends on it only with allow_transmit = true, and sets up only the nodes in transmit_nodes.
 [[can]]
 name = "boom" # the `link` of the rig's channels
 interface = {quoted(interface)}
@@ -74,7 +75,7 @@ channel = {quoted(channel)}
 [[station]]
 profile = {quoted(profile)}
 {listen}
-# Its port, best by a name that stays the adapter's (/dev/rigcal-station by the udev rule); the rest as it is set.
+# Its port, if possible by a persistent name (/dev/rigcal-station from the udev rule), and its serial settings.
 [station.serial]
 path = {quoted(serial.path)}
 baud = {serial.baud}
@@ -85,7 +86,7 @@ stopbits = {serial.stopbits}
     return (
         text
         + """
-# The error that a calibrated model may have, root mean square on held-out fixes: reports then say passed or failed.
+# Largest root mean square error of a calibrated model on held-out fixes: reports then state passed or failed.
 # [report]
 # tolerance_mm = 10.0
 """
@@ -93,23 +94,23 @@ stopbits = {serial.stopbits}
 
 
 def rig_file(name: str, joints: Sequence[JointChoice], prisms: Sequence[str], heard: HeardBus | None) -> str:
-    """Return a rig file with a row for each joint, whose lengths and angles are still to be filled in.
+    """Return a rig file with a row for each joint, whose lengths and angles must still be filled in.
 
     Args:
         name: of the rig.
         joints: from the base outwards.
-        prisms: on the last link.
-        heard: what was heard on its bus; None where nobody listened.
+        prisms: names of prisms on the last link.
+        heard: frames received from its bus; None if the bus was not listened to.
     """
     parts = [
-        f"""# A rig file: docs/how-to/rig-files.md says how to write one, docs/reference/rig-keys.md lists every key.
-# FILL IN what the drawings say: numbers of [[row]], offsets of prisms, zeros of encoders. Lengths mm, angles deg.
+        f"""# A rig file: docs/how-to/rig-files.md shows how to write one, docs/reference/rig-keys.md lists all keys.
+# FILL IN from the drawings: numbers of [[row]], offsets of prisms, zeros of encoders. Lengths in mm, angles in deg.
 {_heard_comment(heard)}
 name = {quoted(name)}
 convention = "mdh_beta_after"
 gravity = [0, 0, -1]      # direction in the base frame
 
-[tolerances]              # 1 sigma: how far the machine may be from these numbers
+[tolerances]              # build tolerances of these numbers, 1 sigma
 length_mm = 5.0
 angle_deg = 0.2
 beta_deg = 0.1
@@ -128,7 +129,7 @@ target_sigma_mm = 1.0
         f"""
 [[prism]]
 name = {quoted(prism)}
-frame = {len(joints)}                 # it sits on the link after that row
+frame = {len(joints)}                 # number of the [[row]] whose link carries it
 offset_mm = [0, 0, {100 * (place + 1)}]   # FILL IN, in that frame
 """
         for place, prism in enumerate(prisms)
@@ -166,7 +167,7 @@ def _row(number: int, joint: JointChoice) -> str:
 alpha_deg = {90 if number % 2 else -90}
 a_mm = {1000 if joint.kind == "revolute" else 0}
 d_mm = 0
-drive = {{ {constant} = {{ {joint.name} = 1.0 }} }}  # -1.0 where the joint counts the other way round
+drive = {{ {constant} = {{ {joint.name} = 1.0 }} }}  # -1.0 if the joint counts in the opposite direction
 """
 
 

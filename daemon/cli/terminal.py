@@ -1,7 +1,7 @@
 """Lines and tables for people on the terminal.
 
-Names of set-ups, operators, prisms and files come from anyone: everything is escaped by `shown`. Colour comes from
-styles alone, and only where a terminal shows it.
+Names of set-ups, operators, prisms and files are untrusted: everything is escaped by `shown`. Colours are used only if
+the terminal shows them.
 """
 
 from __future__ import annotations
@@ -21,73 +21,73 @@ from daemon.host.safe_output import shown, shown_lines
 from daemon.host.systemd import is_journal, priority_prefix
 
 _LISTED = 10
-_LEAST_WRAPPED = 30  # columns for the words of a table's last column
-_MOST_SHOWN = 0.99  # of work that goes on: it is not at its end
-# xterm's sequences: another screen without a cursor, its first place, and back to the terminal as it was.
+_LEAST_WRAPPED = 30  # smallest width at which a table's last column is wrapped
+_MOST_SHOWN = 0.99  # largest share shown for unfinished work
+# Escape sequences of xterm: alternate screen without a cursor, cursor to its origin, and back to the normal screen.
 _BEGIN, _HOME, _END = "\x1b[?1049h\x1b[?25l", "\x1b[H", "\x1b[?25h\x1b[?1049l"
-_BETWEEN = "  "  # the columns of a table
+_BETWEEN = "  "  # between columns of a table
 _REST_OF_LINE, _REST_OF_SCREEN = "\x1b[K", "\x1b[J"
 
 
 class Coloured(NamedTuple):
-    """A cell of a table in a colour, as `click.style` names it."""
+    """A cell of a table with a colour name of `click.style`; "" for no colour."""
 
     text: str
     colour: str
 
 
 def echo(text: object = "", **style: Any) -> None:
-    """Print one line on standard output, with the style options of `click.style`."""
+    """Print one line to standard output, with the style options of `click.style`."""
     click.secho(shown(text), color=_color(), **style)
 
 
 def echo_error(text: str, level: int = logging.INFO) -> None:
-    """Print lines on standard error; in the journal each with its priority.
+    """Print lines to standard error; if that is the journal, each line has its priority.
 
     Args:
         text: the lines.
-        level: how important they are, as `logging` has it.
+        level: their level in `logging`.
     """
     prefix = priority_prefix(level) if is_journal(sys.stderr) else ""
     click.echo("\n".join(prefix + line for line in shown_lines(text).split("\n")), err=True)
 
 
 def echo_text(text: str) -> None:
-    """Print lines on standard output as they are, but for what is not safe to show."""
+    """Print lines to standard output, with only unsafe characters escaped."""
     click.echo(shown_lines(text))
 
 
 def begin_screen() -> None:
-    """Take another screen of the terminal, without a cursor; `end_screen` gives it back."""
+    """Switch to the terminal's alternate screen, without a cursor, until `end_screen`."""
     click.echo(_BEGIN, nl=False, color=True)
 
 
 def end_screen() -> None:
-    """Show the terminal again as it was before `begin_screen`."""
+    """Switch back to the screen from before `begin_screen`."""
     click.echo(_END, nl=False, color=True)
 
 
 def draw_screen(lines: Sequence[tuple[str, Mapping[str, Any]]]) -> None:
-    """Write lines over the screen from its first line on, so that nothing flickers.
+    """Overwrite the screen from its first line without clearing it, so that it does not flicker.
 
     Args:
-        lines: each with its style, as `click.style` names it.
+        lines: each with its style options of `click.style`.
     """
     is_plain = _color() is False
     texts = [shown(text) if is_plain else click.style(shown(text), **style) for text, style in lines]
     drawn = "".join(f"{text}{_REST_OF_LINE}\r\n" for text in texts)
-    click.echo(_HOME + drawn + _REST_OF_SCREEN, nl=False, color=True)  # without colours it is a screen all the same
+    click.echo(_HOME + drawn + _REST_OF_SCREEN, nl=False, color=True)  # keeps the sequences also without colours
 
 
 def echo_list(title: str, sentences: Sequence[str], most: int = _LISTED) -> None:
-    """Print a titled list of at most `most` sentences; nothing where there are none."""
+    """Print a titled list of at most `most` sentences; print nothing if there are none."""
     if not sentences:
         return
     echo(f"{title}:", bold=True)
     for sentence in sentences[:most]:
         echo(f"  - {shown(sentence)}")
     if len(sentences) > most:
-        echo(f"  and {len(sentences) - most} more (--json has all)")
+        echo(f"  and {len(sentences) - most} more (--json lists all)")
 
 
 def echo_table(
@@ -98,14 +98,14 @@ def echo_table(
     text_columns: Sequence[int] | None = None,
     bold: Sequence[bool] = (),
 ) -> None:
-    """Print a table, in which nothing is cut short: where a terminal is narrow, the words of the last column wrap.
+    """Print a table without truncating any cell: on a narrow terminal the last column is wrapped.
 
     Args:
         header: a heading for each column.
         rows: the cells.
-        title: the line above.
-        text_columns: columns that are set flush left; all by default.
-        bold: one flag a row.
+        title: a line above the table; "" for none.
+        text_columns: indices of left-aligned columns; all by default.
+        bold: one flag per row; empty for no bold rows.
     """
     cells = [[cell if isinstance(cell, Coloured) else Coloured(cell, "") for cell in row] for row in rows]
     texts = [[shown(name) for name in header], *([shown(cell.text) for cell in row] for row in cells)]
@@ -138,24 +138,24 @@ def echo_table(
 
 
 def counted(count: int, noun: str) -> str:
-    """Return a number with its noun, which takes an s where there are several."""
+    """Return a number with its noun, with a plural s unless the number is 1."""
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
 
 
 def percent(share: float) -> str:
-    """Return the share that is done of work that goes on; never 100 %."""
+    """Return the share of unfinished work that is done as percentage; never 100 %."""
     return f"{min(share, _MOST_SHOWN):.0%}".replace("%", " %")
 
 
 def _lines(text: str, width: int) -> list[str]:
-    """Return a text in lines of so many columns; a word that is longer, as a path may be, is not broken."""
+    """Wrap a text to lines of `width` columns; a longer word, such as a path, is not broken."""
     if _width(text) <= width:
         return [text]
     return textwrap.wrap(text, width, break_long_words=False, break_on_hyphens=False)
 
 
 def _width(text: str) -> int:
-    """Return the number of columns that a terminal gives to a text."""
+    """Return the number of terminal columns that a text occupies."""
     if text.isascii():
         return len(text)
     narrow = sum(not unicodedata.combining(c) for c in text)
@@ -163,5 +163,5 @@ def _width(text: str) -> int:
 
 
 def _color() -> bool | None:
-    """Return click's `color`: none where NO_COLOR is set (https://no-color.org) or the terminal has none."""
+    """Return click's `color`: False if NO_COLOR is set (https://no-color.org) or the terminal has no colours."""
     return False if os.environ.get("NO_COLOR") or os.environ.get("TERM") == "dumb" else None

@@ -1,5 +1,5 @@
-"""Many rigs: each calibrated by itself, here or on a cluster, then held against each other.
+"""Many rigs: each is calibrated separately, in this process or on a cluster, then they are compared.
 
-sources  where rigs are found;  assess  the work on one of them;  run  all of them, to be resumed;
-comparison  what they have in common;  report, table  the result as HTML and as Parquet
+sources  finds the rigs;  assess  the work on one rig;  run  resumable work on all rigs;
+comparison  finds common deviations and outliers;  report, table  the result as HTML and as Parquet
 """

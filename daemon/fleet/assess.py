@@ -1,7 +1,7 @@
-"""The work on one rig of a fleet: calibrate it, look for what its model lacks, and see whether it has changed.
+"""The work on one rig of a fleet: calibrate it, find effects that its model lacks, and test whether it has changed.
 
-A task carries all that the work needs, and the answer is text and numbers, so that any process on any computer may do
-it. The same task gives the same answer.
+A task holds all input of the work, and the answer is text and numbers, so any process on any computer can do it. The
+same task gives the same answer.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ if TYPE_CHECKING:
     from calibration.rig.description import Rig
     from calibration.run_settings import Run
 
-_WIDER = 10.0  # than the build tolerances: the prior that rigs are compared by
-FORM = 1  # of the answer; a later one is not read for an earlier one
+_WIDER = 10.0  # width of the prior for comparing rigs, as a multiple of the build tolerances
+FORM = 1  # version of the answer's format; answers of other versions are not reused
 
 
 @dataclass(frozen=True)
 class FleetSettings:
-    """Work on each rig.
+    """Settings of the work on each rig.
 
     Attributes:
-        gap: look for missing effects; kinematics alone without.
+        gap: whether to search for missing effects; if False only the kinematics are identified.
         prior: how the build tolerances are used.
-        seed: of everything random.
+        seed: of all random choices.
     """
 
     gap: bool = True
@@ -47,13 +47,13 @@ class RigTask:
     """A rig with its data.
 
     Attributes:
-        name: of the rig among the fleet.
+        name: of the rig in the fleet.
         source: where it was found, for people.
         rig_text: its rig file.
-        data: observations CSV of the sessions that train.
-        checks: observations CSV of check sessions, which never train; None without any.
-        settings: what to do.
-        files: CSV files that `data` is made of, each with the line of `data` that its first row is.
+        data: observations CSV of the training sessions.
+        checks: observations CSV of check sessions, which are never trained on; None if there are none.
+        settings: of the work.
+        files: CSV files that `data` consists of, each with the line in `data` of its first row.
     """
 
     name: str
@@ -65,7 +65,7 @@ class RigTask:
     files: tuple[tuple[str, int], ...] = ()
 
     def place(self, line: int) -> tuple[str, int]:
-        """Return the file that a line of `data` is of, and its number there."""
+        """Return the file that a line of `data` comes from, and its line number there."""
         return next(
             ((name, line - first + 2) for name, first in reversed(self.files) if first <= line),
             (self.files[0][0] if self.files else self.name, line),
@@ -73,20 +73,20 @@ class RigTask:
 
     @property
     def sha256(self) -> str:
-        """SHA-256 of all that decides the answer."""
+        """SHA-256 of all input that determines the answer."""
         told = [str(FORM), self.rig_text, json.dumps(asdict(self.settings), sort_keys=True)]
         parts = [*(text.encode() for text in told), self.data, self.checks or b""]
         return hashlib.sha256(b"".join(hashlib.sha256(part).digest() for part in parts)).hexdigest()
 
 
 def assess(task: RigTask) -> dict[str, Any]:
-    """Calibrate a rig and return what a comparison of rigs needs.
+    """Calibrate a rig and return the input for a comparison of rigs.
 
     Returns:
         JSON: `name`, `source`, `sha256`, `rig`, and either `error` and `kind`, or `fixes`, `sessions`, `noise_mm`,
         `stages` (stage -> RMS, mm), `expected_rms_mm`, `verdict`, `effects`, `parameters` (`name`, `unit`, `value`,
-        `sigma`, and `prior_sigma` by which they are held), `unidentifiable`, `drift` (`session`, `ratio`, `alarm`) or
-        None, and `warnings`.
+        `sigma`, and `prior_sigma` of the widened prior), `unidentifiable`, `drift` (`session`, `ratio`, `alarm`,
+        `reason`) or None, and `warnings`.
     """
     prepare()
     from calibration.errors import CalibrationError, DataError
@@ -139,7 +139,7 @@ def _assessed(task: RigTask, rig: Rig, pool: Executor) -> dict[str, Any]:
 
 
 def _parameters(model: CalibratedModel) -> list[dict[str, Any]]:
-    """Return the constants of the machine, held by a wide prior; where it stands rigs do not have in common."""
+    """Return the constants of the machine under a wide prior, without the base, which differs from rig to rig."""
     from calibration.fleet.hierarchical import widened_prior
 
     known = model.parameters
@@ -162,7 +162,7 @@ def _parameters(model: CalibratedModel) -> list[dict[str, Any]]:
 def _drift(
     task: RigTask, rig: Rig, model: CalibratedModel, observations: Observations, run: Run
 ) -> Mapping[str, Any] | None:
-    """Hold the newest data against a model that has not seen them: check sessions, or the last of several sessions."""
+    """Test the newest data, check sessions or the last of several sessions, with a model not trained on them."""
     from calibration.errors import CalibrationError
     from calibration.evaluation.drift import check
     from calibration.numerics.statistics import Cusum

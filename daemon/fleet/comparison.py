@@ -1,7 +1,7 @@
-"""Rigs held against each other: what they have in common, which differ, which have changed, and who gains from what.
+"""Comparison of rigs: common deviations, outliers, rigs that have changed, and what each rig would gain from.
 
-Rigs are compared with those of the same rig name. Constants of the machine are deviations from the drawings; what the
-prior of one rig's fit adds is taken out before rigs are put together.
+Rigs are compared with rigs of the same rig name. Constants of the machine are deviations from the drawings; the
+influence of the prior in each rig's fit is removed before rigs are combined.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ import numpy as np
 
 from calibration.fleet.hierarchical import FleetEstimate, false_discovery_threshold, fleet_estimate, without_prior
 
-FALSE_SHARE = 0.01  # of what is said to be common, or to be an outlier
-_WORTH = 0.25  # of the noise: less is no gain that anybody would notice
+FALSE_SHARE = 0.01  # false discovery rate of common deviations and of outliers
+_WORTH = 0.25  # smallest gain worth reporting, as a share of the noise
 _DEG_PER_RAD = 57.29577951308232
 
 Answer = Mapping[str, Any]
@@ -28,12 +28,12 @@ class Quantity:
     Attributes:
         rig: name of their rig.
         kind: `parameter` or `effect`.
-        name: `row4.d`, `backlash@theta4:width_rad`.
+        name: for example `row4.d` or `backlash@theta4:width_rad`.
         unit: of all numbers.
-        own, own_sigma: (n,) by each rig's own data; NaN where they tell nothing.
-        fleet: what the rigs have in common.
-        is_common: the fleet's mean is not 0: the drawings, or the rig file, are off for all.
-        outliers: (n,) True where a rig does not belong, by all quantities of the group together.
+        own, own_sigma: (n,) estimate from each rig's own data and its standard error; NaN if they do not determine it.
+        fleet: estimate of the distribution over the rigs.
+        is_common: whether the fleet's mean differs from 0, which means that the drawings or the rig file are wrong.
+        outliers: (n,) True for outlying rigs; the test accounts for the number of quantities in the group.
     """
 
     rig: str
@@ -49,13 +49,13 @@ class Quantity:
 
 @dataclass(frozen=True)
 class Group:
-    """The rigs of one rig name that could be assessed.
+    """The assessed rigs of one rig name.
 
     Attributes:
         rig: their rig name.
-        answers: of each.
-        quantities: that enough of them have measured.
-        effects: `family@where` -> how many rigs it was named in.
+        answers: answer of each rig.
+        quantities: quantities that enough rigs have measured.
+        effects: `family@where` -> number of rigs in which it was named.
     """
 
     rig: str
@@ -65,11 +65,11 @@ class Group:
 
     @property
     def common(self) -> list[Quantity]:
-        """Deviations that all rigs share, the surest first."""
+        """Deviations common to all rigs, the most significant first."""
         return sorted((q for q in self.quantities if q.is_common), key=lambda q: q.fleet.p_common)
 
     def outlying(self, number: int) -> list[Quantity]:
-        """Quantities in which a rig is an outlier, the farthest first."""
+        """Return the quantities in which a rig is an outlier, the largest deviation first."""
         found = [q for q in self.quantities if q.outliers[number]]
         return sorted(found, key=lambda q: -abs(q.fleet.deviation[number]))
 
@@ -88,7 +88,7 @@ class Fleet:
 
 
 def compare(answers: Sequence[Answer]) -> Fleet:
-    """Compare the rigs of a fleet."""
+    """Compare the rigs of a fleet, given the answers of `daemon.fleet.assess.assess`."""
     good = [answer for answer in answers if "error" not in answer]
     names = list(dict.fromkeys(answer["rig"] for answer in good))
     groups = [_group(name, [answer for answer in good if answer["rig"] == name]) for name in names]
@@ -149,7 +149,7 @@ class Gain:
 
     Attributes:
         action: calibrate, effects, poses, recalibrate, resolve or look.
-        gain_mm: by how much the RMS error would fall; NaN where it cannot be told.
+        gain_mm: expected decrease of the RMS error, mm; NaN if unknown.
         text: what to do.
     """
 
@@ -159,17 +159,17 @@ class Gain:
 
 
 def gains(group: Group, number: int) -> list[Gain]:
-    """Return what would help a rig, the most urgent first: changed machines, then the greatest gain."""
+    """Return the actions that would help a rig: urgent ones without a known gain first, then the largest gain."""
     answer = group.answers[number]
     stages, noise = answer["stages"], answer["noise_mm"]
     found: list[Gain] = []
     drift = answer["drift"]
     if drift is not None and drift["alarm"] == "worse":
-        text = f"recalibrate: session {drift['session']} scatters {drift['ratio']:.1f} times what the model expects"
+        text = f"recalibrate: errors in session {drift['session']} are {drift['ratio']:.1f} times the expected size"
         found.append(Gain("recalibrate", float("nan"), text))
     for quantity in group.outlying(number)[:3]:
         deviation = quantity.fleet.deviation[number]
-        text = f"look at {quantity.name}: {deviation:+.1f} standard deviations from the fleet"
+        text = f"inspect {quantity.name}: {deviation:+.1f} standard deviations from the fleet"
         found.append(Gain("look", float("nan"), text))
     if answer["verdict"] == "indistinguishable":
         found.append(Gain("resolve", float("nan"), "measure the poses that `rigcal gap` proposes"))

@@ -1,4 +1,4 @@
-"""A fleet's report: one HTML page with the rigs, what they have in common, and what each would gain."""
+"""The report on a fleet: an HTML page with the rigs, their common deviations, and what each would gain from."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from daemon.report import drawing, markup
 from daemon.report.words import PLUS_MINUS, number, signed
 
 _MOST_QUANTITIES = 20
-_MOST_RIGS = 200  # in a table; the Parquet file has all
+_MOST_RIGS = 200  # rows in a table; the Parquet file has all rigs
 _HEIGHT_IN = 3.4
 
 
 def fleet_report(fleet: Fleet, made: str, files: Sequence[str]) -> str:
-    """Return the page.
+    """Return the report as an HTML page.
 
     Args:
         fleet: the comparison.
-        made: when, for people.
-        files: names of the files beside it.
+        made: time of the report, for people.
+        files: names of the other files of the result.
     """
     rigs = sum(len(group.answers) for group in fleet.groups)
     sections = [_header(fleet, rigs, made)]
@@ -40,8 +40,8 @@ def _header(fleet: Fleet, rigs: int, made: str) -> str:
     outlying = sum(bool(group.outlying(n)) for group in fleet.groups for n in range(len(group.answers)))
     changed = sum(_has_changed(answer) for group in fleet.groups for answer in group.answers)
     lead = (
-        f"Constants of the drawing that are off in the same way on all rigs: {common}. Rigs that differ from the "
-        f"others by more than rigs do: {outlying}. Rigs that have changed since they were measured before: {changed}."
+        f"Constants that deviate from the drawing in the same way on all rigs: {common}. Rigs that differ from the "
+        f"others more than is usual: {outlying}. Rigs that have changed since they were last measured: {changed}."
     )
     before = np.median([a["stages"]["nominal"] for g in fleet.groups for a in g.answers]) if rigs else float("nan")
     after = np.median([a["stages"]["effects"] for g in fleet.groups for a in g.answers]) if rigs else float("nan")
@@ -51,7 +51,7 @@ def _header(fleet: Fleet, rigs: int, made: str) -> str:
         markup.Tile("Median error by the drawings", number(float(before))),
         markup.Tile("Median error calibrated", number(float(after)), kind="after"),
     ]
-    return markup.header("Fleet", made, f"{rigs} rigs held against each other", lead, tiles)
+    return markup.header("Fleet", made, f"Comparison of {rigs} rigs", lead, tiles)
 
 
 def _has_changed(answer: object) -> bool:
@@ -62,9 +62,9 @@ def _has_changed(answer: object) -> bool:
 
 def _overview(group: Group) -> str:
     names = [f"{place} in {count}" for place, count in list(group.effects.items())[:_MOST_QUANTITIES]]
-    effects = f"Effects that were named: {', '.join(names)} of {len(group.answers)} rigs." if names else ""
+    effects = f"Named effects: {', '.join(names)} of {len(group.answers)} rigs." if names else ""
     return markup.section(
-        f"Rigs of the kind {group.rig}",
+        f"Rigs of type {group.rig}",
         _errors_picture(group),
         markup.paragraph(effects) if effects else "",
     )
@@ -85,26 +85,26 @@ def _errors_picture(group: Group) -> str:
         axes.axvline(noise, color=drawing.SOFT, linewidth=0.9, linestyle="--", label="scatter of a fix, median")
         drawing.plain_log_axis(axes, "x")
         axes.set_xlabel("RMS error of a rig on its own fixes, mm")
-        axes.set_ylabel("rigs with less, %")
+        axes.set_ylabel("rigs with a smaller error, %")
         axes.set_ylim(0, 100)
         axes.legend(loc="lower right")
         return drawing.picture(
             figure,
             "Cumulative distribution of the rigs' errors before and after calibration",
-            "How many rigs err by less than so much, by the drawings and calibrated, on each rig's own fixes.",
+            "Share of rigs with an error below a given value, by the drawings and calibrated, on each rig's own fixes.",
         )
 
 
 def _common(group: Group) -> str:
     shared = group.common
     text = (
-        "A constant that deviates from the drawing in the same way on all rigs is a mistake of the drawing or the rig "
-        "file: correct it there, and every rig starts nearer. The spread is what rigs differ by beyond errors of "
-        "measurement: the build tolerance as it is."
+        "A constant that deviates from the drawing in the same way on all rigs is an error in the drawing or the rig "
+        "file: correct it there, and every rig starts closer to the truth. The spread is the variation between rigs "
+        "beyond measurement errors: the actual build tolerance."
     )
     if not shared:
         return markup.section(
-            "In common", markup.paragraph("Nothing deviates from the drawings in the same way on all rigs.")
+            "In common", markup.paragraph("No constant deviates from the drawings in the same way on all rigs.")
         )
     rows = [
         [
@@ -121,7 +121,7 @@ def _common(group: Group) -> str:
 
 
 def _forest(quantity: Quantity) -> str:
-    """Draw one quantity over the rigs: by their own data, and given the fleet."""
+    """Draw one quantity for all rigs: estimated from their own data, and given the fleet."""
     there = np.flatnonzero(np.isfinite(quantity.own))
     order = there[np.argsort(quantity.own[there])]
     place = np.arange(len(order), dtype=np.float64)
@@ -141,13 +141,13 @@ def _forest(quantity: Quantity) -> str:
         handles = [
             drawing.key(drawing.BEFORE, "own data, 95 %"),
             drawing.key(drawing.AFTER, "given the fleet"),
-            drawing.key(drawing.WARN, "does not belong"),
+            drawing.key(drawing.WARN, "outlier"),
         ]
         axes.legend(handles=handles, loc="upper left")
         return drawing.picture(
             figure,
             f"{quantity.name} of every rig with its interval, and the mean of the fleet",
-            f"{quantity.name}: what each rig's own data say, and what is best believed of it given all others.",
+            f"{quantity.name}: the estimate from each rig's own data, and the best estimate given all other rigs.",
         )
 
 
@@ -161,9 +161,9 @@ def _outliers(group: Group) -> str:
         deviation = signed(float(quantity.fleet.deviation[n]), 2)
         rows.append([name, quantity.name, f"{own} {quantity.unit}", f"{mean} {quantity.unit}", deviation])
     if not rows:
-        return markup.section("Outliers", markup.paragraph("Every rig differs from the others by what rigs differ by."))
+        return markup.section("Outliers", markup.paragraph("No rig differs from the others more than is usual."))
     heads = ("rig", "constant", "its value", "fleet", "standard deviations")
-    text = "A part that was exchanged, bent or assembled in another way, or data of another machine."
+    text = "Possible reasons: a part was exchanged, bent or assembled differently, or the data are of another machine."
     return markup.section(
         "Outliers", markup.paragraph(text), markup.table(heads, rows[:_MOST_RIGS], text_columns=(0, 1))
     )
@@ -172,26 +172,27 @@ def _outliers(group: Group) -> str:
 def _drift(group: Group) -> str:
     known = [answer for answer in group.answers if answer["drift"] is not None and answer["drift"]["ratio"] is not None]
     if not known:
-        text = "No rig has a check session or several sessions, so whether they have changed is not known."
+        text = "No rig has a check session or more than one session, so it is unknown whether any has changed."
         return markup.section("Drift", markup.paragraph(text))
     changed = sorted((a for a in known if _has_changed(a)), key=lambda answer: -answer["drift"]["ratio"])
     text = (
-        f"{len(changed)} of {len(known)} rigs have changed, by their newest session and a model that has not seen it."
+        f"{len(changed)} of {len(known)} rigs have changed, judged by their newest session and a model that has not "
+        "seen it."
     )
     rows = [[a["name"], a["drift"]["session"], number(a["drift"]["ratio"])] for a in changed[:_MOST_RIGS]]
-    heads = ("rig", "session", "error over what is expected")
+    heads = ("rig", "session", "error / expected error")
     table = markup.table(heads, rows, text_columns=(0, 1)) if rows else ""
     return markup.section("Drift", markup.paragraph(text), table)
 
 
 def _gains(group: Group) -> str:
     rows = _gain_rows(group)
-    text = "For each rig what helps most, what has changed first, then by the millimetres that its error would fall."
+    text = "What would help each rig most: urgent actions first, then by the expected decrease of its error in mm."
     heads = ("rig", "calibrated RMS, mm", "scatter of a fix, mm", "gain, mm", "what to do")
     table = markup.table(heads, rows[:_MOST_RIGS], text_columns=(4,))
     more = f"{len(rows) - _MOST_RIGS} more rigs are in the table file." if len(rows) > _MOST_RIGS else ""
     return markup.section(
-        "Who would gain from what", markup.paragraph(text), table, markup.paragraph(more) if more else ""
+        "What each rig would gain from", markup.paragraph(text), table, markup.paragraph(more) if more else ""
     )
 
 
@@ -202,7 +203,7 @@ def _gain_rows(group: Group) -> list[list[str]]:
         offered = gains(group, n)
         first = offered[0].gain_mm if offered else 0.0
         texts = [gain.text + (f" ({number(gain.gain_mm)} mm)" if np.isfinite(gain.gain_mm) else "") for gain in offered]
-        told = "; ".join(texts) or "nothing: it is at its noise"
+        told = "; ".join(texts) or "nothing: its error is at the noise level"
         row = [answer["name"], number(answer["stages"]["effects"]), number(answer["noise_mm"]), number(first), told]
         rows.append((np.inf if np.isnan(first) else first, row))
     return [row for _, row in sorted(rows, key=lambda each: -each[0])]

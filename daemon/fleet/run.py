@@ -1,7 +1,7 @@
-"""All rigs of a fleet, one after another or on a dask cluster; what is done stays done.
+"""Assesses all rigs of a fleet, one after another or on a dask cluster; an interrupted run can be resumed.
 
-Each rig's answer is a file, written whole as soon as it is there. A run that is given again takes the answers that are
-of the same data, settings and form, and works on the others. No more tasks are in flight than keep the workers busy, so
+Each rig's answer is written atomically to a file as soon as it is complete. A repeated run reuses answers with the same
+data, settings and format, and works on the other rigs. Only as many tasks are in flight as keep the workers busy, so
 memory does not grow with the fleet.
 """
 
@@ -26,15 +26,15 @@ if TYPE_CHECKING:
 
 RESULTS = "rigs"
 _AHEAD = 2  # tasks in flight for each thread of a worker
-_TRIES = 3  # of a rig that several workers died at, each time as many as the scheduler allows (3 by default)
+_TRIES = 3  # submissions of a rig whose workers die; dask itself allows several deaths per submission (3 by default)
 
 Answer = dict[str, Any]
 Told = Callable[[int, int, str], None]
-"""Told how many rigs are done, of how many, and which was the last."""
+"""Called with the number of finished rigs, the number of all rigs, and the name of the last one."""
 
 
 class Engine(Protocol):
-    """Place where the work is done: this process, worker processes, or a cluster."""
+    """What carries out the work: this process, worker processes, or a cluster."""
 
     def answers(self, tasks: Iterator[RigTask]) -> Iterator[Answer]:
         """Yield the answer to each task, in any order."""
@@ -44,16 +44,16 @@ class Here:
     """This process, one rig after another."""
 
     def answers(self, tasks: Iterator[RigTask]) -> Iterator[Answer]:
-        """Yield the answers in the order of the tasks; as on a cluster, no error of one rig ends the others."""
+        """Yield the answers in the order of the tasks; an error of one rig does not stop the others."""
         for task in tasks:
             try:
                 yield assess(task)
-            except Exception as error:  # noqa: BLE001 - it is that rig's answer, and the others go on
+            except Exception as error:  # noqa: BLE001 - the error is the rig's answer
                 yield _failed(task.name, task.source, error)
 
 
 class Cluster:
-    """The workers of a dask scheduler. What a worker was at when it died is done again by another.
+    """The workers of a dask scheduler; the task of a worker that dies is repeated by another worker.
 
     Args:
         client: connected to the scheduler.
@@ -63,7 +63,7 @@ class Cluster:
         self._client = client
 
     def answers(self, tasks: Iterator[RigTask]) -> Iterator[Answer]:
-        """Yield the answers as they come."""
+        """Yield the answers in the order of completion."""
         from distributed import KilledWorker, as_completed
 
         running = as_completed()
@@ -93,7 +93,7 @@ class Cluster:
 
 @contextmanager
 def local_workers(count: int) -> Iterator[Client]:
-    """Yield a client of worker processes on this computer; one that is gone is started anew.
+    """Yield a client of `count` worker processes on this computer; workers that die are restarted.
 
     Raises:
         ImportError: `distributed` is not installed.
@@ -111,7 +111,7 @@ def local_workers(count: int) -> Iterator[Client]:
         ) as cluster,
         Client(cluster) as client,
     ):
-        # The nanny of a worker that does not start in time gives up: without this the cluster would stay empty.
+        # A worker's nanny stops trying if the worker does not start in time: without this the cluster stays empty.
         cluster.adapt(minimum=count, maximum=count)
         yield client
 
@@ -123,10 +123,10 @@ def assess_all(
 
     Args:
         sources: the rigs.
-        settings: what is done with each.
+        settings: of the work on each rig.
         out: directory of the result; answers are kept in `rigs/`.
-        engine: where the work is done.
-        told: progress.
+        engine: carries out the work.
+        told: called after each rig, for progress.
 
     Raises:
         OSError: an answer cannot be written.
@@ -160,7 +160,7 @@ def assess_all(
 
 
 def _kept(path: Path, sha256: str) -> Answer | None:
-    """Return the answer that an earlier run has left, if it is of the same task."""
+    """Return the answer of an earlier run if it is for the same task, else None."""
     try:
         found = json.loads(path.read_bytes())
     except (OSError, ValueError):

@@ -20,18 +20,18 @@ from drivers.files import read_text, read_whole
 
 STORE = "rigcal.sqlite"
 RIG_FILE = "rig.toml"
-_NOTHING = f"neither a {STORE} nor CSV files of observations in it"
+_NOTHING = f"contains neither a {STORE} nor CSV files of observations"
 _CSV_MAX_BYTES = 128 << 20
 
 
 @dataclass(frozen=True)
 class RigSource:
-    """A rig of the fleet; its data are read when its turn comes.
+    """A rig of the fleet; its data are read only when it is assessed.
 
     Attributes:
-        name: unique among the fleet.
+        name: unique in the fleet.
         path: a store, or a directory of CSV files.
-        rig: the rig file of a directory that has none.
+        rig: rig to use for a directory without a rig file.
     """
 
     name: str
@@ -42,8 +42,8 @@ class RigSource:
         """Read the rig's data.
 
         Raises:
-            CalibrationError, StoreError: they cannot be used.
-            OSError: they cannot be read.
+            CalibrationError, StoreError: the data cannot be used.
+            OSError: the data cannot be read.
         """
         if self.path.is_file():
             return _of_store(self, settings)
@@ -54,14 +54,14 @@ def find_rigs(directories: Sequence[Path], pattern: str | None, rig: str | None)
     """Find the rigs of a fleet, in the order of their names.
 
     Args:
-        directories: each of one rig, with a store or with CSV files of observations.
-        pattern: of the paths of further stores.
-        rig: the rig of directories without a `rig.toml`.
+        directories: one for each rig, with a store or with CSV files of observations.
+        pattern: glob pattern of the paths of further stores; None for none.
+        rig: rig to use for directories without a `rig.toml`.
 
     Raises:
-        DataError: no directory holds either, the pattern matches nothing, or there is no rig at all.
+        DataError: no directory contains data, the pattern matches nothing, or there is no rig at all.
     """
-    found: list[tuple[Path, Path]] = []  # what names the rig, and where its data are
+    found: list[tuple[Path, Path]] = []  # the path that names the rig, and the path of its data
     for directory in directories:
         store = directory / STORE
         if store.is_file():
@@ -73,10 +73,10 @@ def find_rigs(directories: Sequence[Path], pattern: str | None, rig: str | None)
     if pattern is not None:
         stores = sorted(Path(path) for path in glob.glob(pattern, recursive=True) if Path(path).is_file())
         if not stores:
-            raise DataError(pattern, "no such store; quote the pattern, so that the shell leaves it alone")
+            raise DataError(pattern, "matches no store; quote the pattern, so that the shell does not expand it")
         found += [(store.parent if store.name == STORE else store, store) for store in stores]
     if not found:
-        raise DataError("fleet", "name directories of rigs, or stores with --stores")
+        raise DataError("fleet", "no rigs given; name directories of rigs, or stores with --stores")
     return [RigSource(name, path, rig) for name, path in sorted(_named(found))]
 
 
@@ -85,13 +85,13 @@ def _has_data(path: Path) -> bool:
 
 
 def _named(found: Sequence[tuple[Path, Path]]) -> Iterator[tuple[str, Path]]:
-    """Name rigs by their directories, with so many of those above that no two have the same name."""
+    """Name rigs by their directories, with as many parent directories as make the names unique."""
     parts = [path.resolve().parts for path, _ in found]
     depth = next(
         (n for n in range(1, max(map(len, parts)) + 1) if len({part[-n:] for part in parts}) == len(parts)), None
     )
     if depth is None:
-        raise DataError("fleet", "the same rig is named twice")
+        raise DataError("fleet", "the same rig is given twice; name each rig once")
     for (_, data), part in zip(found, parts, strict=True):
         yield "-".join(part[-depth:]).replace("/", "-"), data
 
@@ -100,7 +100,7 @@ def _of_store(source: RigSource, settings: FleetSettings) -> RigTask:
     with Reader(source.path) as reader:
         training, checks = sessions_of_use(reader)
         if not training:
-            raise DataError(str(source.path), "no closed session that calibration may use")
+            raise DataError(str(source.path), "contains no closed session that calibration may use")
         newest = session(reader, training[-1])
         assert newest is not None  # it was just listed
         text = str(newest["rig_text"])
@@ -119,14 +119,16 @@ def _of_directory(source: RigSource, settings: FleetSettings) -> RigTask:
     elif source.rig is not None:
         text = load_rig(source.rig).text
     else:
-        raise DataError(str(source.path), f"no {RIG_FILE} in it; name the rig with --rig")
+        raise DataError(str(source.path), f"contains no {RIG_FILE}; name the rig with --rig")
     training: list[Path] = []
     checks: list[Path] = []
     for path in sorted(source.path.glob("*.csv")):
-        if b"prism" in _header(path):  # joints and fixes of an export have their own files beside
+        if b"prism" in _header(path):  # an export also has files of joints and of fixes
             (checks if _is_check(path) else training).append(path)
     if not training:
-        raise DataError(str(source.path), "no CSV file of observations that may train: one with a column prism")
+        raise DataError(
+            str(source.path), "contains no CSV file of training observations; such a file has a column prism"
+        )
     data, files = _joined(training)
     return RigTask(source.name, str(source.path), text, data, _joined(checks)[0] or None, settings, files)
 
@@ -137,20 +139,21 @@ def _header(path: Path) -> bytes:
 
 
 def _is_check(path: Path) -> bool:
-    """Return True for a check session, as the file beside an exported session tells."""
+    """Return True if the session file of an exported session describes a check session."""
     told = path.with_suffix(".json")
     return told.is_file() and read_session_file(told).kind == "check"
 
 
 def _joined(paths: Sequence[Path]) -> tuple[bytes, tuple[tuple[str, int], ...]]:
-    """Return several CSV files as one, and each file's name with the line that its first row is there."""
+    """Join CSV files; return the joined data, and each file's name with the line of its first row in the data."""
     if not paths:
         return b"", ()
     header = _header(paths[0])
     parts, files, line = [header + b"\n"], [], 2
     for path in paths:
         if _header(path) != header:
-            raise DataError(path.name, f"has other columns than {paths[0].name}; the files of a rig have the same", 1)
+            reason = f"its columns differ from those of {paths[0].name}; all files of a rig must have the same columns"
+            raise DataError(path.name, reason, 1)
         parts.append(_ended(read_whole(path, _CSV_MAX_BYTES).partition(b"\n")[2]))
         files.append((path.name, line))
         line += parts[-1].count(b"\n")

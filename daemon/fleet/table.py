@@ -1,4 +1,4 @@
-"""A fleet as one table: a row for each rig and quantity, as Parquet, or as CSV where pyarrow is not installed."""
+"""A fleet as one table: a row for each rig and quantity, as Parquet, or as CSV if pyarrow is not installed."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _BATCH = 100_000
 
 
 def rows(fleet: Fleet) -> Iterator[dict[str, Any]]:
-    """Yield the rows: figures of each rig first, then what its data say of each quantity beside the fleet's."""
+    """Yield the rows: for each rig its figures, then its own estimate and the fleet's estimate of each quantity."""
     for group in fleet.groups:
         for number, answer in enumerate(group.answers):
             head = {"rig_name": answer["name"], "source": answer["source"], "rig": group.rig}
@@ -70,7 +70,7 @@ def _row(**given: Any) -> dict[str, Any]:
 
 
 def write_table(fleet: Fleet, out: Path) -> Path:
-    """Write `fleet.parquet`, or `fleet.csv` where pyarrow is not installed; return the file."""
+    """Write `fleet.parquet`, or `fleet.csv` if pyarrow is not installed; return the file's path."""
     try:
         import pyarrow as pa
         import pyarrow.parquet as pq

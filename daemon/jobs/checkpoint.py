@@ -1,4 +1,4 @@
-"""A file in which a long search keeps its findings, so that a killed command goes on where it was."""
+"""A checkpoint file of a long search, from which a killed command resumes."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from daemon.host.safe_output import write_file
 
 
 class FileCheckpoint:
-    """`calibration.identification.search.checkpoint.Checkpoint` in a file that is there whole or not at all.
+    """`calibration.identification.search.checkpoint.Checkpoint` in a file that is replaced atomically.
 
-    A context manager that forgets it where the work is done or refused, which would end the same way again, and keeps
-    it where the work was interrupted.
+    As a context manager it deletes the file when the work is done or refused with CalibrationError, which would recur,
+    and keeps it when the work was interrupted.
 
     Args:
-        path: of the file; its directory is made where it is missing.
+        path: of the file; a missing directory is created.
     """
 
     def __init__(self, path: Path) -> None:
@@ -30,17 +30,17 @@ class FileCheckpoint:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         if kind is None or issubclass(kind, CalibrationError):
-            with contextlib.suppress(OSError):  # a refusal matters more than what it leaves behind
+            with contextlib.suppress(OSError):  # a leftover file must not hide the CalibrationError
                 self._path.unlink(missing_ok=True)
 
     def load(self) -> bytes | None:
-        """Return the state that was saved last; None where there is nothing to read."""
+        """Return the state that was saved last; None if the file cannot be read."""
         try:
             return self._path.read_bytes()
         except OSError:
             return None
 
     def save(self, state: bytes) -> None:
-        """Keep a state in place of the one before; OSError where the file system refuses."""
+        """Replace the saved state; OSError if the file cannot be written."""
         self._path.parent.mkdir(parents=True, exist_ok=True)
         write_file(self._path, state)

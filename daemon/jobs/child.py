@@ -1,4 +1,4 @@
-"""A job's process, seen from the daemon: started with an order, listened to, and ended with all that it started."""
+"""The daemon's side of a job's process: starts it with an order, reads its messages, ends it with its children."""
 
 from __future__ import annotations
 
@@ -17,19 +17,20 @@ from daemon.jobs.order import Order, Outcome, Progress, Started, parse_message
 
 log = logging.getLogger(__name__)
 
-# -P keeps the current directory off the process's path: what lies there is no code of ours.
+# -P keeps the current directory off the module search path, so that no file there is imported.
 JOB_COMMAND = (sys.executable, "-P", "-m", "daemon.jobs.process")
 MAX_LINE_BYTES = 16 * 2**20
 MAX_LOGGED_BYTES = 4096
 
 
 class JobChild:
-    """A running job; a context manager that leaves nothing of it behind.
+    """A running job; a context manager that ends the process and all that it started.
 
     Args:
-        order: what to do, told on standard input, which stays open: the process ends when its parent is gone.
-        command: what does it, with the protocol of `daemon.jobs.order` on standard output.
-        jobs_socket: where systemd listens, to start a unit in place of a child; a child where nothing listens there.
+        order: sent on the process's standard input, which stays open: when it closes, the process ends.
+        command: program and arguments of the child; it speaks the protocol of `daemon.jobs.order`.
+        jobs_socket: socket at which systemd listens to start the job as a unit; None, or a socket at which nothing
+            listens, for a child process.
 
     Raises:
         OSError: the process cannot be started.
@@ -39,7 +40,7 @@ class JobChild:
         self._process = _process(command, jobs_socket)
         self._lines: queue.SimpleQueue[bytes] = queue.SimpleQueue()
         self._job_id = order.job_id
-        # All pipes have a thread of their own: one that the process does not empty must not hold up a cancellation.
+        # Each pipe has its own thread: a pipe that the process does not read must not delay a cancellation.
         work: list[tuple[Callable[..., None], tuple[Any, ...], str]] = [(self._tell, (order.to_line(),), "-order")]
         work.append((self._read, (), ""))
         if self._process.errors is not None:
@@ -53,7 +54,7 @@ class JobChild:
 
     @property
     def pid(self) -> int | None:
-        """Number of the process; None as long as it has not told."""
+        """Process id; None until it is known."""
         return self._process.pid
 
     def __enter__(self) -> JobChild:
@@ -69,7 +70,7 @@ class JobChild:
             self._process.orders.close()
 
     def next_message(self, timeout_s: float) -> Started | Progress | Outcome | None:
-        """Return the process's next message, its end included; None when it says nothing for `timeout_s`."""
+        """Return the next message of the process, including its end; None if none arrives within `timeout_s`."""
         try:
             line = self._lines.get(timeout=timeout_s)
         except queue.Empty:
@@ -80,19 +81,19 @@ class JobChild:
         return message
 
     def _tell(self, line: bytes) -> None:
-        with contextlib.suppress(OSError):  # it died first, and the end of its output will tell
+        with contextlib.suppress(OSError):  # the process has died, which the end of its output shows
             self._process.orders.write(line)
             self._process.orders.flush()
 
     def _read(self) -> None:
-        """Lines of the process's output, and b"" at its end."""
-        with contextlib.suppress(OSError), self._process.messages as output:  # a connection that was reset
+        """Queue the lines of the process's output, and b"" at its end."""
+        with contextlib.suppress(OSError), self._process.messages as output:  # the connection was reset
             while line := output.readline(MAX_LINE_BYTES):
                 self._lines.put(line)
         self._lines.put(b"")
 
     def _log(self, errors: IO[bytes]) -> None:
-        """Log what the process says on standard error, each line as important as it says."""
+        """Log the lines of the process's standard error with the priorities that they carry."""
         with errors:
             while line := errors.readline(MAX_LOGGED_BYTES):
                 level, text = parse_line(line.rstrip().decode("utf-8", "replace"))
@@ -105,8 +106,8 @@ def _process(command: Sequence[str], jobs_socket: str | None) -> JobProcess:
             return UnitProcess(jobs_socket)
         except OSError as error:
             log.warning(
-                "systemd does not listen for jobs at %s (%s), so the job runs beside acquisition, with a lower "
-                "priority alone; `systemctl start rigcal-jobs.socket`",
+                "systemd does not listen for jobs at %s (%s), so the job runs as a child of the daemon, with a lower "
+                "priority but no limits of its own; run `systemctl start rigcal-jobs.socket`",
                 jobs_socket,
                 error.strerror or error,
             )

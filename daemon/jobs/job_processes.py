@@ -1,7 +1,7 @@
 """Processes of jobs: a unit that systemd starts for a connection, or else a child of the daemon (decision 0028).
 
-Either reads its order from standard input, which stays open as long as the daemon wants the job, and tells its messages
-on standard output (`daemon.jobs.order`).
+Either reads its order from standard input, which stays open until the job ends or is cancelled, and writes its messages
+to standard output (`daemon.jobs.order`).
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from typing import IO, Protocol
 
 from daemon.host.priority import JOB_NICE, lower_priority
 
-JOBS_SOCKET = "RIGCAL_JOBS_SOCKET"  # environment variable: where systemd listens for jobs
-END_TIMEOUT_S = 5.0  # from the end of a process's output to its own
+JOBS_SOCKET = "RIGCAL_JOBS_SOCKET"  # environment variable: path of the socket at which systemd listens for jobs
+END_TIMEOUT_S = 5.0  # from the end of a process's output to the end of the process
 CONNECT_TIMEOUT_S = 5.0
 
 
@@ -26,10 +26,10 @@ class JobProcess(Protocol):
     """A process that carries out an order.
 
     Attributes:
-        pid: of the process; None as long as it has not told.
+        pid: process id; None until it is known.
         orders: its standard input.
         messages: its standard output.
-        errors: its standard error; None where that goes to the journal by itself.
+        errors: its standard error; None if systemd sends it to the journal.
     """
 
     pid: int | None
@@ -38,23 +38,23 @@ class JobProcess(Protocol):
     errors: IO[bytes] | None
 
     def identify(self, pid: int) -> None:
-        """Take the number that the process tells of itself."""
+        """Take the process id that the process reports."""
 
     def last_words(self) -> str:
-        """Tell the end of a process that told no result."""
+        """Return how the process ended, for one that sent no result."""
 
     def kill(self) -> None:
         """End the process and all that it has started."""
 
 
 class ChildProcess:
-    """A child of the daemon, which leads a process group of its own and has a lower priority.
+    """A child of the daemon, with its own process group and a lower priority.
 
     Args:
         command: program and arguments.
 
     Raises:
-        OSError: it cannot be started.
+        OSError: the process cannot be started.
     """
 
     def __init__(self, command: Sequence[str]) -> None:
@@ -70,7 +70,7 @@ class ChildProcess:
         lower_priority(JOB_NICE, self._process.pid)
 
     def identify(self, pid: int) -> None:
-        """Nothing to take: the number of a child is known."""
+        """Do nothing: the process id of a child is known."""
 
     def last_words(self) -> str:
         try:
@@ -78,11 +78,11 @@ class ChildProcess:
         except subprocess.TimeoutExpired:
             return "its process closed its output without a result"
         if status < 0:
-            return f"its process was killed by signal {-status} ({signal.strsignal(-status)}) before it told a result"
-        return f"its process ended with status {status} and no result; the daemon's log may tell why"
+            return f"its process was killed by signal {-status} ({signal.strsignal(-status)}) before it had a result"
+        return f"its process ended with status {status} and no result; see the daemon's log"
 
     def kill(self) -> None:
-        # Unwaited for, the process keeps its group's number, so that no other group can have it.
+        # Until it is waited for, the process keeps its group id, so no other group can have that id.
         with contextlib.suppress(ProcessLookupError):
             os.killpg(self._process.pid, signal.SIGKILL)
         self._process.wait()
@@ -91,14 +91,14 @@ class ChildProcess:
 class UnitProcess:
     """The main process of a unit `rigcal-jobs@.service`, which systemd starts for a connection.
 
-    Its limits are those of the unit and of its slice, its standard error goes to the journal, and what it has started
-    systemd ends with it. It tells its number first: a connection does not show it, for systemd had made the socket.
+    The unit and its slice set its limits, its standard error goes to the journal, and systemd ends its children with
+    it. It first sends its process id, which the connection does not show because systemd created the socket.
 
     Args:
-        path: of the socket that systemd listens at.
+        path: of the socket at which systemd listens.
 
     Raises:
-        OSError: nothing listens there.
+        OSError: nothing listens at the socket.
     """
 
     def __init__(self, path: str) -> None:
@@ -117,7 +117,7 @@ class UnitProcess:
         self._process_fd: int | None = None
 
     def identify(self, pid: int) -> None:
-        """Take hold of the process by a descriptor: its number may be another one's by the time it is ended."""
+        """Open a descriptor of the process: by the time it is ended, its process id may have been reused."""
         if self._process_fd is None and pid not in (os.getpid(), os.getppid()) and pid > 1:
             with contextlib.suppress(ProcessLookupError):  # it has ended already
                 self._process_fd = os.pidfd_open(pid)
@@ -125,8 +125,8 @@ class UnitProcess:
 
     def last_words(self) -> str:
         return (
-            "its process ended without a result: it ran into its memory limit, or it failed; "
-            "`journalctl -u 'rigcal-jobs@*'` tells why"
+            "its process ended without a result: it reached its memory limit, or it failed; "
+            "see `journalctl -u 'rigcal-jobs@*'`"
         )
 
     def kill(self) -> None:
@@ -134,7 +134,7 @@ class UnitProcess:
             self._socket.shutdown(socket.SHUT_RDWR)
         self._socket.close()
         if self._process_fd is None:
-            return  # the end of its input ends it
+            return  # the process ends when its input closes
         with contextlib.suppress(ProcessLookupError):
             signal.pidfd_send_signal(self._process_fd, signal.SIGKILL)
         end = select.poll()

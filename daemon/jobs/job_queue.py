@@ -1,7 +1,7 @@
-"""Every way in which a job changes its state, and the order that a job's process is given.
+"""All state changes of jobs, and the orders for their processes.
 
-Each change reads and writes in one transaction, and transactions take turns: an operator's command and the outcome of a
-job's process meet here, and the second of the two finds what the first one did.
+Each change reads and writes in one transaction, and transactions are serialized: if an operator's command and the
+outcome of a job's process coincide, the second of them sees the effect of the first.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ class JobQueue:
 
     Args:
         store: the database.
-        rig_name: whose sessions are worked on.
-        clock: time of the changes.
+        rig_name: rig whose sessions are used.
+        clock: for the times of changes.
 
     Attributes:
-        table: of the jobs.
+        table: the jobs in the store.
     """
 
     def __init__(self, store: Store, rig_name: str, clock: Clock) -> None:
@@ -47,7 +47,7 @@ class JobQueue:
         self._guides = GuideTable(store, rig_name)
 
     def state(self) -> State:
-        """The facts that scheduling goes by."""
+        """Return the facts that scheduling depends on."""
         run = self._models.live_run()
         back_to = {JobKind.GAP: 0, JobKind.REPORT: 0} | ({JobKind.DRIFT: run.after_session} if run else {})
         covered = {kind: self.table.covered(kind, after) for kind, after in back_to.items()}
@@ -63,7 +63,7 @@ class JobQueue:
         )
 
     def _stale_candidate(self, run: LiveRun) -> int | None:
-        """See `State.stale_candidate`; one comparison for each model that goes live, as what fails must not loop."""
+        """See `State.stale_candidate`; one comparison per model that goes live, so that a failing one does not loop."""
         candidate = self._models.waiting()
         if candidate is None or candidate.comparison is None or candidate.comparison["live"] == run.model_id:
             return None
@@ -72,7 +72,7 @@ class JobQueue:
     # ---- orders ------------------------------------------------------------------------------------------------------
 
     def order(self, job: JobFacts, config: Config) -> Order:
-        """The order of a job's process: the sessions were settled when the job was queued."""
+        """Return the order for a job's process; its sessions were fixed when the job was queued."""
         row = self.table.get(job.id)
         sessions = self.table.sessions_of(job.id, row["through_session_id"])
         training = tuple(s["id"] for s in sessions if s["kind"] != CHECK)
@@ -80,7 +80,7 @@ class JobQueue:
         if row["model_id"] is not None:
             return self._comparison(job, config, self._models.get(row["model_id"]), checks)
         if job.kind is JobKind.GAP:
-            # Drifted checks trigger it to find the reason in them; after a training session they are held out.
+            # Triggered by a drifted check, the job searches the checks too. After a training session they are held out.
             if job.session_id in checks:
                 return self._order(job, config, tuple(s["id"] for s in sessions))
             return self._order(job, config, training, held_out_ids=checks)
@@ -104,10 +104,10 @@ class JobQueue:
         )
 
     def _comparison(self, job: JobFacts, config: Config, model: ModelRow, checks: tuple[str, ...]) -> Order:
-        """Compare a model with the live one, on the check sessions that neither was trained on."""
+        """Order a comparison of a model with the live one, on the check sessions that neither was trained on."""
         live = self._models.live()
         if live is not None and live.id == model.id:
-            live = None  # it is live already, and only the nominal model is left to compare it with
+            live = None  # the model is live itself, so only the nominal model is left to compare it with
         seen = trained_on([model, live])
         return self._order(
             job,
@@ -120,7 +120,7 @@ class JobQueue:
         )
 
     def _drift_order(self, job: JobFacts, config: Config, checks: list[tuple[int, str]]) -> Order:
-        """Hold the live model against the check sessions since it went live that it was not held against yet."""
+        """Order a check of the live model on the check sessions since it went live that were not used for this yet."""
         run = self._models.live_run()
         if run is None:
             return self._order(job, config, ())
@@ -156,9 +156,9 @@ class JobQueue:
     # ---- for the runner ----------------------------------------------------------------------------------------------
 
     def queue(self, due: DueChain) -> None:
-        """Queue new jobs: training in its order, and those that check a model after the job that makes it.
+        """Queue new jobs: training jobs one after the other, jobs that check a model after the job that makes it.
 
-        A report that fails thus keeps no comparison from running, nor the other way round.
+        So a failing report does not prevent the comparison, nor the reverse.
         """
         with self._store.transaction():
             made_by: int | None = None
@@ -168,12 +168,12 @@ class JobQueue:
                     made_by = job_id
 
     def begin(self, job: JobFacts, time_limit_s: float, host_boot: str | None = None) -> bool:
-        """Start a queued job, which then shows nothing of earlier runs; False if it is queued no more.
+        """Mark a queued job as running and clear what earlier runs left; return False if it is no longer queued.
 
         Args:
-            job: which.
-            time_limit_s: how long it may run.
-            host_boot: the computer's boot; None where it is unknown.
+            job: the job.
+            time_limit_s: how long it may run, in seconds.
+            host_boot: boot id of the computer; None if unknown.
         """
         with self._store.transaction():
             if self.table.get(job.id)["state"] != "queued":
@@ -196,29 +196,30 @@ class JobQueue:
             return True
 
     def note_process(self, job_id: int, pid: int) -> None:
-        """Note the process of a running job."""
+        """Store the process id of a running job."""
         self.table.change(job_id, pid=pid)
 
     def note_progress(self, job_id: int, progress: Progress) -> None:
-        """Note the progress of a running job."""
+        """Store the progress of a running job."""
         self.table.change(job_id, progress=progress.share, message=progress.message)
 
     def is_cancelled(self, job_id: int) -> bool:
-        """True if the operator wants a running job to end."""
+        """Return True if the operator has cancelled a running job."""
         return _is_cancelled(self.table.get(job_id))
 
     def end(self, job_id: int, outcome: Outcome, *, is_attempt: bool = True) -> Outcome:
-        """End a job; with one that failed or was cancelled end those that wait for it.
+        """End a job; if it failed or was cancelled, also cancel the jobs that depend on it.
 
-        An orderly stop of the daemon is no fault of the job's and no attempt.
+        A clean shutdown of the daemon is not the job's fault and does not count as an attempt.
 
         Args:
-            job_id: which.
-            outcome: how.
-            is_attempt: False if something else than the job interrupted it: it is counted as that, and as no attempt.
+            job_id: number of the job.
+            outcome: how it ended.
+            is_attempt: False if the job was interrupted through no fault of its own, which counts as an interruption
+                and not as an attempt.
 
         Returns:
-            how it ended in the end: what the operator said goes before what the process said.
+            The final outcome: a cancellation by the operator takes precedence over the process's result.
         """
         with self._store.transaction():
             job = self.table.get(job_id)
@@ -234,7 +235,7 @@ class JobQueue:
                 interruptions=job["interruptions"] + (not is_attempt),
                 result_json=outcome.result,
                 progress=1.0 if is_done else 0.0,
-                message="",  # what it was doing is no news any more
+                message="",  # the last step is no longer of interest
                 pid=None,
                 **ended,
             )
@@ -253,23 +254,24 @@ class JobQueue:
             return outcome
 
     def interrupt_running(self, why: str, *, is_attempt: bool = True) -> None:
-        """Interrupt the jobs that are marked as running and that nobody runs: the scheduler offers them again.
+        """Mark jobs as interrupted that are marked as running but do not run: the scheduler queues them again.
 
         Args:
-            why: they did not end.
+            why: the reason that is stored as their error.
             is_attempt: as for `end`.
         """
         for row in self.table.running():
             self.end(row["id"], Outcome("interrupted", why), is_attempt=is_attempt)
 
     def interrupt_left_over(self, host_boot: str) -> None:
-        """Interrupt the jobs that the daemon before this one left running.
+        """Mark jobs as interrupted that the previous run of the daemon left marked as running.
 
-        One that a stop had no time to write down was stopped in order. One of another boot was cut off with the
-        computer. Of the rest the daemon was killed, which may have been the job's doing, and is an attempt.
+        After a clean shutdown the job was stopped with the daemon, which had no time to store it. A job of an earlier
+        boot was interrupted by a restart of the computer. Otherwise the daemon was killed: the job may have caused
+        that, so it counts as an attempt.
 
         Args:
-            host_boot: the computer's boot.
+            host_boot: boot id of the computer.
         """
         for row in self.table.running():
             if row["host_boot"] not in (host_boot, None):
@@ -286,43 +288,44 @@ class JobQueue:
         """Cancel a job that has not ended.
 
         Returns:
-            a sentence for the operator.
+            A sentence for the operator.
 
         Raises:
-            CommandError: it has ended.
-            NotInStoreError: there is none.
+            CommandError: the job has ended.
+            NotInStoreError: there is no such job.
         """
         with self._store.transaction():
             job = self.table.get(job_id)
             if job["state"] not in CANCELLABLE:
-                raise CommandError(f"job {job['id']} is {job['state']}; only one that has not ended can be cancelled")
+                raise CommandError(f"job {job['id']} is {job['state']}; only a job that has not ended can be cancelled")
             if job["state"] == "running":
-                # Whoever runs it, now or after a restart, finds it there.
+                # The runner finds the cancellation in the store, also after a restart.
                 self.table.change(job["id"], error=CANCELLED.error)
                 return f"job {job['id']} ({job['kind']}) is being cancelled"
             self.end(job["id"], CANCELLED)
             return f"job {job['id']} ({job['kind']}) is cancelled"
 
     def retry(self, job_id: object) -> str:
-        """Queue a job that did not end well again, and with it those that waited for it; their attempts count anew.
+        """Queue a failed, cancelled or interrupted job again, with the jobs that depend on it; reset their attempts.
 
         Returns:
-            a sentence for the operator.
+            A sentence for the operator.
 
         Raises:
-            CommandError: it has not ended or ended well, or the one before it did not end well.
-            NotInStoreError: there is none.
+            CommandError: the job is queued, running or done, or the job that it depends on must be retried first.
+            NotInStoreError: there is no such job.
         """
         with self._store.transaction():
             job = self.table.get(job_id)
             if job["state"] not in RETRIABLE:
-                raise CommandError(f"job {job['id']} is {job['state']}; only one that did not end well can be retried")
+                states = "only a failed, cancelled or interrupted job can be retried"
+                raise CommandError(f"job {job['id']} is {job['state']}; {states}")
             if job["depends_on"] is not None:
                 before = self.table.get(job["depends_on"])
                 if before["state"] in RETRIABLE:
                     raise CommandError(
-                        f"job {job['id']} waits for job {before['id']}, which is {before['state']}; retry that one: "
-                        "those that wait for it follow"
+                        f"job {job['id']} depends on job {before['id']}, which is {before['state']}; retry job "
+                        f"{before['id']}: the jobs that depend on it follow"
                     )
             for waiting in self.table.chain(job["id"]):
                 self.table.change(
@@ -334,17 +337,17 @@ class JobQueue:
         """Queue a comparison of a model with the live one, on all check sessions that are closed and used.
 
         Returns:
-            a sentence for the operator.
+            A sentence for the operator.
 
         Raises:
-            CommandError: there is none.
+            CommandError: there is no such check session.
         """
         closed = self._sessions.used()
         checks = [session["id"] for session in closed if session["kind"] == CHECK]
         if not checks:
             raise CommandError(
-                "no check session is closed and used, so nothing is held out to compare on; hold one with `rigcal "
-                "session start --kind check`",
+                "no closed check session can be used, so there are no held-out fixes to compare on; hold a check "
+                "session: `rigcal session start --kind check`",
                 REFUSED,
             )
         run = self._models.live_run()
@@ -355,7 +358,7 @@ class JobQueue:
         return f"job {job_id} will compare model {model.id} with the live one"
 
     def compare_again(self, model_id: int) -> str:
-        """Queue a comparison of the model of that number, as `compare` does."""
+        """Queue a comparison of the model with this number, as `compare` does."""
         return self.compare(self._models.get(model_id))
 
     def _add(self, kind: JobKind, session_id: str, through_id: str, **columns: int | None) -> int:
@@ -365,5 +368,5 @@ class JobQueue:
 
 
 def _is_cancelled(job: Mapping[str, Any]) -> bool:
-    """True if the operator wants a running job to end; one that runs has no other error."""
+    """Return True if the operator has cancelled a running job, the only error that a running job can have."""
     return (job["state"], job["error"]) == ("running", CANCELLED.error)

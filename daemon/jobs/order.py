@@ -1,7 +1,7 @@
-"""The messages between the daemon and a job's process: an order one way, a JSON object a line the other.
+"""The messages between the daemon and a job's process.
 
-The process tells its number first, `{"pid": 4711}`, then any number of `{"progress": 0.3, "message": "..."}` and last
-`{"result": {...}}` or `{"error": "..."}`.
+The daemon sends one order. The process answers with one JSON object per line: first its process id, `{"pid": 4711}`,
+then any number of `{"progress": 0.3, "message": "..."}`, and last `{"result": {...}}` or `{"error": "..."}`.
 """
 
 from __future__ import annotations
@@ -17,24 +17,24 @@ QUOTED_BYTES = 60
 
 @dataclass(frozen=True)
 class Order:
-    """The work that the daemon asks a job's process for.
+    """The work that the daemon gives to a job's process.
 
     Attributes:
         kind: gap, residual, report, comparison or drift.
-        job_id: names the files that the job writes.
-        store: the store, opened read-only.
-        models_directory: where models go, a directory each.
+        job_id: number of the job, which names the files that it writes.
+        store: path of the store, which is opened read-only.
+        models_directory: parent directory of the models' directories.
         session_ids: sessions to use: to train on (gap), to hold out (report, comparison, drift).
+        seed: of all random choices.
         model: the model directory to start from (residual, report, comparison).
-        model_sha256: of its manifest: which model is meant, whatever has come to lie there since.
+        model_sha256: checksum of the model's manifest, which identifies the model even if its directory has changed.
         train_ids: sessions that the model was trained on (report).
-        seed: of every random choice.
-        live_model, live_sha256: directory and manifest of the live model, if there is one (comparison, drift).
-        live_id: its number in the store (comparison, drift).
-        live_since: number of the change by which it went live (drift).
-        held_out_ids: sessions that nothing is fitted to, to judge by (gap).
-        tolerance_mm: root mean square error that the machine may have (gap, report); None where none is stated.
-        store_file: device and inode of the store that the daemon has open: another file of that name is none of its.
+        live_model, live_sha256: directory and manifest checksum of the live model, if there is one (comparison, drift).
+        live_id: number of the live model in the store (comparison, drift).
+        live_since: number of the change by which the live model went live (drift).
+        held_out_ids: sessions that are held out to judge the model (gap).
+        tolerance_mm: root mean square error that the machine may have (gap, report); None if none is configured.
+        store_file: device and inode of the store that the daemon has open, so that a replaced file is detected.
     """
 
     kind: str
@@ -55,12 +55,12 @@ class Order:
     store_file: tuple[int, int] | None = None
 
     def to_line(self) -> bytes:
-        """Return the line that the process reads."""
+        """Return the order as the line that the process reads."""
         return json.dumps(asdict(self)).encode() + b"\n"
 
     @classmethod
     def from_line(cls, line: str) -> Order:
-        """Return the order in a line that `to_line` made."""
+        """Parse a line that `to_line` made."""
         order = json.loads(line)
         lists = ("session_ids", "train_ids", "held_out_ids", "store_file")
         return cls(**order | {key: tuple(order[key]) for key in lists if order[key] is not None})
@@ -68,10 +68,10 @@ class Order:
 
 @dataclass(frozen=True)
 class Started:
-    """The beginning of a job.
+    """The start of a job.
 
     Attributes:
-        pid: of its process.
+        pid: id of its process.
     """
 
     pid: int
@@ -82,8 +82,8 @@ class Progress:
     """Progress of a job.
 
     Attributes:
-        share: of the whole, 0 to 1.
-        message: what it does now.
+        share: share of the work that is done, 0 to 1.
+        message: current step.
     """
 
     share: float
@@ -96,7 +96,7 @@ class Outcome:
 
     Attributes:
         state: done, failed, cancelled or interrupted, as in the store.
-        error: one sentence, None when it is done.
+        error: one sentence; None if the job is done.
         result: what the store keeps of a job that is done.
     """
 
@@ -106,7 +106,7 @@ class Outcome:
 
 
 def parse_message(line: bytes) -> Started | Progress | Outcome:
-    """Return the message of a job's process in one line; a line that is no message is a job that failed."""
+    """Parse a line from a job's process; a line that is not a message counts as failure of the job."""
     try:
         message = json.loads(line)
     except (ValueError, RecursionError):
@@ -121,4 +121,4 @@ def parse_message(line: bytes) -> Started | Progress | Outcome:
         case {"error": str() as error}:
             return Outcome("failed", error)
     said = line.rstrip()[:QUOTED_BYTES].decode("utf-8", "replace")
-    return Outcome("failed", f"its process said {said!r}, which is no message of a job; the daemon's log may tell why")
+    return Outcome("failed", f"its process sent {said!r}, which is not a message of a job; see the daemon's log")

@@ -1,8 +1,8 @@
-"""The process of a job: it reads the store, computes, writes files, tells its parent.
+"""The process of a job: reads the store, computes, writes files, and reports to the daemon.
 
-Standard input carries the order, one JSON object, and then stays open: when it closes, the daemon is gone and so goes
-the job. Standard output carries what `daemon.jobs.order` describes, and standard error log lines with their priorities.
-Only the daemon writes to the store.
+Standard input carries the order, one JSON object, and then stays open: when it closes, the daemon is gone and the job
+ends. Standard output carries the messages that `daemon.jobs.order` describes, standard error carries log lines with
+their priorities. Only the daemon writes to the store.
 """
 
 from __future__ import annotations
@@ -53,20 +53,20 @@ from drivers.clock import NS_PER_S, SystemClock
 
 log = logging.getLogger(__name__)
 
-_COMPUTED = 0.9  # share of a job's work that is done when its model is known and nothing is written yet
-_LEAST_FIXES = 4  # three place a base and say nothing more
+_COMPUTED = 0.9  # progress of a job when its model is computed but not yet written
+_LEAST_FIXES = 4  # three fixes determine a base and nothing else
 
 
 def main() -> int:
-    """Entry of the process: exit status 0 when a result was told, 1 when an error was, 2 when the daemon was gone."""
+    """Run the process; the exit status is 0 after a result, 1 after an error, 2 if the daemon has gone."""
     line = sys.stdin.readline()
     if not line:
-        return 2  # the daemon was gone before it could say what to do
-    set_up_logging(is_prefixed=True)  # the daemon reads standard error, and logs it
+        return 2  # the daemon ended before it sent the order
+    set_up_logging(is_prefixed=True)  # the daemon logs what it reads from standard error
     order = Order.from_line(line)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     tell = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
-    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # a library that prints must not break the protocol
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # output that a library prints must not break the protocol
 
     def say(message: dict[str, Any]) -> None:
         tell.write(json.dumps(message) + "\n")
@@ -80,7 +80,7 @@ def main() -> int:
             say({"error": str(error)})
         else:
             log.error("%s failed", order.kind, exc_info=error)
-            say({"error": f"{type(error).__name__}: {error}; the daemon's log has the whole story"})
+            say({"error": f"{type(error).__name__}: {error}; see the daemon's log for details"})
         return 1
     say({"result": result})
     return 0
@@ -89,15 +89,18 @@ def main() -> int:
 def perform(order: Order, progress: Progress) -> dict[str, Any]:
     """Carry out an order with the functions that the offline commands use.
 
+    Args:
+        order: the work.
+        progress: called with the share of the work that is done and the current step.
+
     Returns:
-        The result that the store keeps: of a new model `model` (its directory), `manifest_sha256`, `stage`, `metrics`,
-        `sessions`, and for one of the gap workflow `gap` (the object of `rigcal gap`), `sentence` and `report` (the
-        file); for a report `report` (the file) and `evaluation` (the object of `rigcal evaluate`) and
-        `latency` (session -> latency of its fixes); for a comparison
-        `comparison`; for drift `drift`.
+        The result that the store keeps. For a new model: `model` (its directory), `manifest_sha256`, `stage`,
+        `metrics`, `sessions`, and after the gap workflow also `gap` (the object of `rigcal gap`), `sentence` and
+        `report` (the file). For a report: `report` (the file), `evaluation` (the object of `rigcal evaluate`) and
+        `latency` (session -> latency of its fixes). For a comparison: `comparison`. For drift: `drift`.
 
     Raises:
-        CalibrationError: in a sentence, what is wrong with data or result.
+        CalibrationError: data or result cannot be used; the message is one sentence.
     """
     prepare()
     work = {
@@ -111,7 +114,7 @@ def perform(order: Order, progress: Progress) -> dict[str, Any]:
 
 
 def _find_gap(order: Order, progress: Progress) -> dict[str, Any]:
-    """Identify the kinematics, and what the simulation lacks; of the checks only those it was not found in judge it."""
+    """Identify the kinematics and the effects that the simulation lacks; judge the model on the held-out checks."""
     clock = SystemClock()
     started_ns = clock.monotonic_ns()
     text = _rig_text(order)
@@ -119,7 +122,7 @@ def _find_gap(order: Order, progress: Progress) -> dict[str, Any]:
     observations = _placing(rig, _observations(order, rig, order.session_ids))
     held_out = _held_out(order, rig, observations)
     models = Path(order.models_directory)
-    # The job keeps its number when it runs again, so it goes on where the daemon was killed.
+    # The job keeps its number when it runs again, so it resumes where the daemon was killed.
     with FileCheckpoint(models / f"{order.job_id:05d}.checkpoint") as checkpoint:
         found = find_gap(
             rig,
@@ -145,10 +148,10 @@ def _find_gap(order: Order, progress: Progress) -> dict[str, Any]:
 
 
 def _placing(rig: Rig, observations: Observations) -> Observations:
-    """The rows at set-ups with enough fixes to place a base beside what they tell of the machine.
+    """Return the rows at set-ups with enough fixes to determine the base and something of the machine.
 
-    Checks may have few, and so may a session that an operator accepted. Repeats of a pose count once. All rows where no
-    set-up has enough: what is wrong with them is for the calibration to say.
+    Checks may have few fixes, and so may a session that an operator accepted. Repeats of a pose count once. If no
+    set-up has enough, return all rows: the calibration then reports the error.
     """
     chain = Chain(rig, {setup: Placement.identity() for setup in np.unique(observations.setup).tolist()})
     _, different = np.unique(averaged(chain, observations).of_row, return_index=True)
@@ -157,24 +160,24 @@ def _placing(rig: Rig, observations: Observations) -> Observations:
     if placed.all() or not placed.any():
         return observations
     for setup in setups[~placed]:
-        log.warning("set-up %s is left out: it has fewer than %d fixes in different poses", setup, _LEAST_FIXES)
+        log.warning("set-up %s is skipped: it has fewer than %d fixes in different poses", setup, _LEAST_FIXES)
     return observations.select(np.isin(observations.setup, setups[placed]))
 
 
 def _held_out(order: Order, rig: Rig, training: Observations) -> Observations | None:
-    """The checks' rows at the set-ups of the training; None where there are none."""
+    """Return the check sessions' rows at set-ups of the training data; None if there are none."""
     if not order.held_out_ids:
         return None
     try:
         checks = _observations(order, rig, order.held_out_ids)
     except DataError as error:
-        log.warning("the check sessions judge nothing: %s", error)
+        log.warning("the check sessions cannot be used to judge the model: %s", error)
         return None
     return checks.select(np.isin(checks.setup, training.setup)) or None
 
 
 def _trained_on(order: Order, model: CalibratedModel) -> Observations:
-    """The training rows of a model: those at the set-ups that it was placed at."""
+    """Return the training rows of a model: those at the set-ups whose base it includes."""
     observations = _observations(order, model.rig, order.train_ids)
     return observations.select(np.isin(observations.setup, list(model.placements)))
 
@@ -223,7 +226,7 @@ def _report(order: Order, progress: Progress) -> dict[str, Any]:
 
 
 def _latencies(order: Order, model: CalibratedModel) -> dict[str, Latency | str]:
-    """The latency of each session's fixes against the joints, or why it is not known."""
+    """Return session -> latency of its fixes relative to the joint readings, or the reason why it is unknown."""
     found: dict[str, Latency | str] = {}
     for name in (*order.train_ids, *order.session_ids):
         try:
@@ -236,7 +239,7 @@ def _latencies(order: Order, model: CalibratedModel) -> dict[str, Latency | str]
 
 
 def _compare(order: Order, progress: Progress) -> dict[str, Any]:
-    """The candidate beside the live model, on sessions that neither was trained on."""
+    """Compare the candidate with the live model on sessions that neither was trained on."""
     result: dict[str, Any] = {"model": order.model, "sessions": list(order.train_ids)}
     about = {
         "manifest_sha256": order.model_sha256,
@@ -254,21 +257,21 @@ def _compare(order: Order, progress: Progress) -> dict[str, Any]:
         try:
             live = read_model(Path(order.live_model), order.live_sha256)
         except ModelError as error:
-            # What cannot be used any more must not keep a good model from its place; the operator sees why.
+            # An unusable live model must not keep a good candidate from replacing it; the operator sees the reason.
             note = f"the live model cannot be read ({error}); "
     if live is not None and (why := candidate.rig.misreading(live.rig)):
-        live, note = None, f"the live model is of another rig file ({why}), so it says nothing of these readings; "
+        live, note = None, f"the live model has a different rig file ({why}), so it does not fit these readings; "
     compared = compare_held_out(candidate, live, _observations(order, candidate.rig, order.session_ids)).as_dict()
     return result | {"comparison": about | compared | {"sentence": f"{note}{compared['sentence']}"}}
 
 
 def _check_drift(order: Order, progress: Progress) -> dict[str, Any]:
-    """The live model on check sessions that it was not trained on, one by one."""
+    """Evaluate the live model on each of the check sessions that it was not trained on."""
     checks: list[dict[str, Any]] = []
     if order.session_ids:
         live = read_model(Path(str(order.live_model)), order.live_sha256)
         for done, name in enumerate(order.session_ids):
-            progress(done / len(order.session_ids), f"holding check session {name} against the live model")
+            progress(done / len(order.session_ids), f"comparing check session {name} with the live model")
             try:
                 found = check(live, _observations(order, live.rig, (name,)))
             except (DataError, UnsafeError) as error:
@@ -284,7 +287,7 @@ def _check_drift(order: Order, progress: Progress) -> dict[str, Any]:
 
 
 def _facts(order: Order, model: CalibratedModel, session_ids: Sequence[str], name: str) -> Facts:
-    """The first lines of a report: who measured what, when and with what, as the store knows it."""
+    """Return the head of a report: who measured what, when and with which devices, according to the store."""
     with _store(order) as reader:
         measured = sessions_measured(reader, session_ids)
     return Facts(
@@ -301,14 +304,14 @@ def _store(order: Order) -> Reader:
 
 
 def _rig_text(order: Order) -> str:
-    """The rig file of the newest session: the sessions carry what they were recorded with.
+    """Return the rig file of the newest session; each session stores the rig file that it was recorded with.
 
     Raises:
-        DataError: no session may be used any more.
+        DataError: none of the sessions can be used any more.
     """
     if not order.session_ids:
         raise DataError(
-            "sessions", "none of those that the job was queued for may be used any more; `rigcal session list` says why"
+            "sessions", "none that the job was queued for can be used any more; `rigcal session list` shows why"
         )
     with _store(order) as reader:
         newest = session(reader, order.session_ids[-1])
@@ -325,7 +328,7 @@ def _observations(order: Order, rig: Rig, session_ids: tuple[str, ...]) -> Obser
 def _made(
     directory: Path, sha256: str, model: CalibratedModel, stage: str, observations: Observations
 ) -> dict[str, Any]:
-    """The result that the store keeps of a model that was trained on these observations."""
+    """Return the result that the store keeps of a model that was trained on these observations."""
     evaluation = evaluate(model, observations)
     return {
         "model": str(directory),

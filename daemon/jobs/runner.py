@@ -1,7 +1,7 @@
-"""Runs jobs: queues what is due, one process at a time, and writes down what becomes of it.
+"""Runs jobs: queues those that are due, runs one process at a time, and stores progress and outcome.
 
-The runner is one thread of the daemon. A job's process (`daemon.jobs.process`) reads the store and tells progress and
-result on its standard output; only the daemon writes.
+The runner is one thread of the daemon. A job's process (`daemon.jobs.process`) reads the store and writes progress and
+result to its standard output; only the daemon writes to the store.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from drivers.clock import NS_PER_S, Clock, SystemClock
 log = logging.getLogger(__name__)
 
 POLL_S = 0.5
-LISTEN_S = 0.2  # a running job that is silent is looked after this often
+LISTEN_S = 0.2  # how often a running job that sends nothing is checked
 STOP_TIMEOUT_S = 30.0
 
 
@@ -36,13 +36,13 @@ class JobRunner:
 
     Args:
         store: where jobs, their results and models are written.
-        config: limits, seed and places.
-        rig_name: whose sessions are used.
-        clock: time.
-        command: what carries out an order, with the protocol of `daemon.jobs.order`.
-        jobs_socket: where systemd listens, to start each job as a unit of its own; None: jobs are children.
-        is_held: true while nothing may be started.
-        work_clock: of the computer; work takes real time, whatever the rig's clock does.
+        config: limits, seed and paths.
+        rig_name: rig whose sessions are used.
+        clock: for the times of changes.
+        command: program and arguments that carry out an order, with the protocol of `daemon.jobs.order`.
+        jobs_socket: socket at which systemd listens to start each job as a unit; None to run jobs as children.
+        is_held: returns True while no job may start.
+        work_clock: the host's clock, for durations of work; the rig's clock may run at a different rate.
     """
 
     def __init__(
@@ -68,50 +68,50 @@ class JobRunner:
         self._queue = JobQueue(store, rig_name, clock)
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="jobs", daemon=True)
-        self._is_computer_at_fault = False  # for a step that failed
-        self._told = ""  # the fault of this thread that the log has last
+        self._is_computer_at_fault = False  # whether the last step failed through no fault of a job
+        self._told = ""  # the last error of this thread that was logged
         store.unless_damaged(lambda: self._queue.interrupt_left_over(self._host_boot), None)
 
     def start(self) -> None:
-        """Begin to queue and run."""
+        """Start the thread that queues and runs jobs."""
         self._thread.start()
 
     def stop(self) -> None:
-        """End the running job (it is marked interrupted, and offered again at the next start) and the thread."""
+        """End the thread and the running job, which is marked interrupted and queued again after the next start."""
         self._stopping.set()
         if self._thread.is_alive():
             self._thread.join(timeout=STOP_TIMEOUT_S)
 
     def compare(self, model: ModelRow) -> str:
-        """Queue a comparison of a model with the live one and say so.
+        """Queue a comparison of a model with the live model, and return a sentence for the operator.
 
         Raises:
-            CommandError: nothing is held out, or no job would ever run.
+            CommandError: there is no held-out session, or jobs are disabled.
         """
         if not self._settings.enabled:
             raise CommandError(
-                f"model {model.id} cannot be compared: jobs are switched off; set [jobs] enabled = true in the "
-                "configuration and start rigcal again",
+                f"model {model.id} cannot be compared: jobs are disabled; set [jobs] enabled = true in the "
+                "configuration and restart rigcal",
                 REFUSED,
             )
         return self._queue.compare(model)
 
     def awaited_session(self) -> str | None:
-        """Return the session whose jobs are queued in a moment, unless a next one begins; None without one."""
+        """Return the session whose jobs will be queued soon unless a new session starts; None if there is none."""
         return awaited_session(self._queue.state()) if self._settings.enabled else None
 
     # ---- commands of the operator ------------------------------------------------------------------------------------
 
     def list_command(self, _arguments: Mapping[str, Any]) -> list[dict[str, Any]]:
-        """All jobs with their results and how long they took in real time, newest last."""
+        """Return all jobs with their results and their durations in real time, newest last."""
         return self._queue.table.all(self._clock)
 
     def cancel_command(self, arguments: Mapping[str, Any]) -> str:
-        """Cancel a job that has not ended, and with it those that wait for it."""
+        """Cancel a job that has not ended, and the jobs that depend on it."""
         return self._queue.cancel(arguments.get("id"))
 
     def retry_command(self, arguments: Mapping[str, Any]) -> str:
-        """Queue a job that failed, was cancelled or was interrupted again, and with it those that waited for it."""
+        """Queue a failed, cancelled or interrupted job again, together with the jobs that depend on it."""
         return self._queue.retry(arguments.get("id"))
 
     # ---- the thread --------------------------------------------------------------------------------------------------
@@ -125,21 +125,21 @@ class JobRunner:
                 self._is_computer_at_fault = isinstance(error, sqlite3.Error) or (
                     isinstance(error, OSError) and error.errno in LACKING
                 )
-                if str(error) != self._told:  # a damaged table would fill the log
-                    log.exception("the scheduler has failed; it goes on")
+                if str(error) != self._told:  # a damaged table would otherwise fill the log
+                    log.exception("the scheduler has failed and will try again")
                 self._told = str(error)
                 did_something = False
             if not did_something:
                 self._stopping.wait(POLL_S)
 
     def _step(self) -> bool:
-        """Queue what is due and run what is next; True if a job ran."""
+        """Queue the jobs that are due and run the next one; return True if a job ran."""
         state = self._queue.state()
         if any(job.state == "running" for job in state.jobs):
-            # None runs between two steps: the last step failed. A full disk is not the job's doing, nor is a lack of
-            # descriptors or memory that keeps its process from being started.
+            # No job runs between two steps, so the last step failed. The job is not to blame for a full disk, nor for a
+            # lack of descriptors or memory that kept its process from starting.
             self._queue.interrupt_running(
-                "the daemon could not see it through; its log may tell why", is_attempt=not self._is_computer_at_fault
+                "an error of the daemon stopped it; see the daemon's log", is_attempt=not self._is_computer_at_fault
             )
             return False
         if self._is_held():
@@ -151,9 +151,9 @@ class JobRunner:
             if isinstance(item, DueChain):
                 self._queue.queue(item)
             elif isinstance(item, DueComparison):
-                log.info("another model is live: %s", self._queue.compare_again(item.model_id))
+                log.info("a different model is live: %s", self._queue.compare_again(item.model_id))
             elif self._queue.table.offer_again(item.job_id):
-                log.info("job %d is offered again after an interruption", item.job_id)
+                log.info("job %d is queued again after an interruption", item.job_id)
         next_one = next_job(self._queue.state() if due else state)
         if next_one is None or not self._queue.begin(next_one, self._settings.time_limit_s, self._host_boot):
             return False
@@ -162,13 +162,14 @@ class JobRunner:
 
     def _give_up(self, job: JobFacts) -> None:
         if job.attempts >= self._settings.max_attempts:
-            often = f"interrupted {job.attempts} times, as often as [jobs] max_attempts allows"
+            often = f"interrupted {job.attempts} times, the most that [jobs] max_attempts allows"
         else:
             often = (
-                f"cut off {job.interruptions} times by what is not its own fault; something is wrong with the computer"
+                f"interrupted {job.interruptions} times through no fault of its own, which points to a fault of the "
+                "computer"
             )
-        error = f"{often}; `rigcal jobs retry {job.id}` tries once more"
-        log.warning("job %d (%s) is given up: %s", job.id, job.kind, error)
+        error = f"{often}; `rigcal jobs retry {job.id}` tries again"
+        log.warning("job %d (%s) is abandoned: %s", job.id, job.kind, error)
         self._queue.end(job.id, Outcome("failed", error))
 
     def _perform(self, job: JobFacts) -> None:
@@ -179,7 +180,7 @@ class JobRunner:
                 self._queue.note_process(job.id, child.pid)
             outcome = self._follow(job.id, child)
         is_cut_off = outcome.state == "failed" and self._is_store_gone()
-        if is_cut_off:  # its process read another store than the daemon's, or none: it waits until the file is back
+        if is_cut_off:  # the process found no store or a different one; the job waits until the daemon's file is back
             outcome = Outcome("interrupted", outcome.error)
         outcome = self._queue.end(job.id, outcome, is_attempt=not is_cut_off)
         level = logging.INFO if outcome.state == "done" else logging.WARNING
@@ -187,14 +188,14 @@ class JobRunner:
         log.log(level, "job %d (%s) is %s%s", job.id, job.kind, outcome.state, why)
 
     def _is_store_gone(self) -> bool:
-        """True if another file, or none, lies where the store was opened."""
+        """Return True if the file at the store's path is missing or not the one that was opened."""
         try:
             return self._store.files.changed() is not None
         except OSError:
             return True
 
     def _follow(self, job_id: int, child: JobChild) -> Outcome:
-        """Write down a process's progress until it tells a result, dies, is cancelled, or its time is up."""
+        """Store a process's progress until it sends a result, dies, is cancelled, or reaches its time limit."""
         limit_s = self._settings.time_limit_s
         deadline_ns = self._work_clock.monotonic_ns() + int(limit_s * NS_PER_S)
         while True:

@@ -1,14 +1,14 @@
-"""Which jobs are due: a pure function of what the store holds and of the time. It starts nothing.
+"""Decides which jobs are due, as a pure function of the store's contents and the time. It starts nothing.
 
-A closed session triggers the gap workflow, which identifies the kinematics and adds what the simulation lacks, then
-residual training, and of that model the report and the comparison with the live one, which do not wait for each other.
-A closed check session triggers report and comparison alone, its poses are not trained on, and the live model is held
-against it. Once the checks have drifted from the live model, the chain runs on all that was measured, checks included.
-A session that no control points vouch for triggers nothing until an operator accepts it. A candidate that was compared
-with a model that is live no more is compared again, once for each model that goes live. Work waits while a session is
+A closed session triggers the gap workflow, which identifies the kinematics and adds the effects that the simulation
+lacks, then residual training. The report and the comparison with the live model follow, independent of each other.
+A closed check session triggers only report and comparison. Its poses are not trained on, and the live model is checked
+for drift on it. Once the checks show drift of the live model, the whole chain runs on all sessions, checks included.
+A session that no control points confirm triggers nothing until an operator accepts it. A candidate that was compared
+with a model that is no longer live is compared again, once for each model that goes live. Jobs wait while a session is
 open: acquisition comes first.
 
-What a job covers is decided by the order of sessions, never by time: a wall clock may be wrong for whole boots.
+The order of sessions decides which sessions a job covers, never time: a wall clock may be wrong for a whole boot.
 """
 
 from __future__ import annotations
@@ -23,33 +23,33 @@ from drivers.clock import NS_PER_S, Stamp
 CHECKS = (JobKind.REPORT, JobKind.COMPARISON)
 CHAIN = (JobKind.GAP, JobKind.RESIDUAL, *CHECKS)
 DRIFT = (JobKind.DRIFT,)
-_QUIET_S = 2.0  # after a session's end: its jobs wait for a next session to begin
-_QUIET_IN_GUIDE_S = 60.0  # the same where a guide is open, which goes on to the next prism by itself
-# An interrupted job waits this long times its attempts and interruptions, so that one that kills the daemon or the
-# computer does not do so without pause.
+_QUIET_S = 2.0  # after a session's end: its jobs wait in case a new session starts
+_QUIET_IN_GUIDE_S = 60.0  # the same while a guide is open, which goes on to the next prism by itself
+# An interrupted job waits for this time multiplied by its attempts and interruptions, so that a job that kills the
+# daemon or the computer does not do so continuously.
 _RETRY_AFTER_S = 5.0
-# A job is not to blame for power cuts; one that exhausts the computer until it restarts must end all the same.
+# A job is not to blame for power cuts, but a job that exhausts the computer until it restarts must be abandoned.
 MAX_INTERRUPTIONS = 20
 
 
 @dataclass(frozen=True)
 class State:
-    """The contents of the store, as far as they can still matter.
+    """The contents of the store that scheduling depends on.
 
     Attributes:
-        sessions: those that calibration may use, in the order they were started; those older than the newest of their
-            kind and state may be left out.
-        jobs: those that have not ended for good, in the order they were created.
-        covered: kind of job -> number of the newest session that was closed when the newest job of the kind was
-            queued: that job works on it and on all before it. No entry where there is no such job, or where an
-            operator has accepted a session since, which the job does not know of.
-        has_model: a model exists that a check session could be held against.
-        live_from: number of the newest session when the live model went live; None without one. Checks after it count
-            for drift.
-        drifted: number and id of the check session with which the live model was found to have drifted; None before.
-        stale_candidate: the model that waits to be accepted, where its comparison is with another model than the live
-            one and none with the live one was queued yet.
-        has_guide: a guide is open.
+        sessions: sessions that calibration may use, in the order of their start; those older than the newest of the
+            same kind and state may be left out.
+        jobs: jobs that are not yet done, failed or cancelled, in the order of their creation.
+        covered: kind of job -> number of the newest session that was closed when the newest job of that kind was
+            queued; that job uses this session and all before it. No entry if there is no such job, or if an operator
+            has accepted a session since, which the job does not include.
+        has_model: whether there is a model that a check session can be compared with.
+        live_from: number of the newest session when the live model went live; None without a live model. Check
+            sessions after it count for drift.
+        drifted: number and id of the check session that showed drift of the live model; None if there is no drift.
+        stale_candidate: number of the candidate model if it was compared with a model that is no longer live and no
+            comparison with the live one was queued yet; else None.
+        has_guide: whether a guide is open.
     """
 
     sessions: Sequence[SessionFacts]
@@ -64,12 +64,12 @@ class State:
 
 @dataclass(frozen=True)
 class DueChain:
-    """Jobs to queue: those that train each to run after the one before it is done, CHECKS after the last of them.
+    """Jobs to queue: each training job depends on the one before it, and CHECKS depend on the last training job.
 
     Attributes:
-        kinds: what to run.
-        session_id: the session that triggers them; a check session triggers CHAIN because it has drifted.
-        through_id: they work on the sessions closed up to and including this one.
+        kinds: kinds of the jobs.
+        session_id: the session that triggers them; a check session triggers CHAIN if it shows drift.
+        through_id: they use the closed sessions up to and including this one.
     """
 
     kinds: tuple[JobKind, ...]
@@ -95,12 +95,12 @@ Due = DueChain | DueRetry | DueComparison
 
 
 def due_jobs(state: State, now: Stamp, *, max_attempts: int = 3) -> list[Due]:
-    """Return all that should be queued now.
+    """Return the jobs that should be queued now.
 
     Args:
-        state: what the store holds.
-        now: the present instant; durations are taken on the monotonic clock, within one boot.
-        max_attempts: an interrupted job that was started this often is not offered again.
+        state: the store's contents.
+        now: current time; durations are measured on the monotonic clock, within one boot.
+        max_attempts: an interrupted job that was started this many times is not queued again.
     """
     if _is_open(state):
         return []
@@ -119,7 +119,7 @@ def due_jobs(state: State, now: Stamp, *, max_attempts: int = 3) -> list[Due]:
 
 
 def awaited_session(state: State) -> str | None:
-    """Return the session that has ended and will trigger jobs unless a next one begins; None without one."""
+    """Return the closed session that will trigger jobs unless a new session starts; None if there is none."""
     if _is_open(state):
         return None
     chains = (item for item in _due_after(_closed(state), state) if isinstance(item, DueChain))
@@ -131,12 +131,12 @@ def _closed(state: State) -> list[SessionFacts]:
 
 
 def _due_after(closed: Sequence[SessionFacts], state: State) -> list[Due]:
-    """Return what the sessions that have ended trigger, once it has been quiet for long enough."""
+    """Return what the closed sessions trigger once no session has started for long enough."""
     due: list[Due] = []
     training = [s for s in closed if s.kind != CHECK]
     checks = [s for s in closed if s.kind == CHECK]
     if training and not _is_covered(training[-1], JobKind.GAP, state):
-        due.append(DueChain(CHAIN, training[-1].id, closed[-1].id))  # its report holds the model against the checks
+        due.append(DueChain(CHAIN, training[-1].id, closed[-1].id))  # its report evaluates the model on the checks
     elif state.drifted is not None and state.covered.get(JobKind.GAP, 0) < state.drifted[0]:
         due.append(DueChain(CHAIN, state.drifted[1], closed[-1].id))
     elif checks and state.has_model and not _is_covered(checks[-1], JobKind.REPORT, state):
@@ -149,14 +149,14 @@ def _due_after(closed: Sequence[SessionFacts], state: State) -> list[Due]:
 
 
 def spent_jobs(state: State, *, max_attempts: int = 3) -> list[JobFacts]:
-    """Interrupted jobs that were started or interrupted so often that they are not offered again."""
+    """Return the interrupted jobs that were started or interrupted too often to be queued again."""
     return [job for job in state.jobs if job.state == "interrupted" and _is_spent(job, max_attempts)]
 
 
 def next_job(state: State) -> JobFacts | None:
-    """The first queued job whose predecessor is done.
+    """Return the first queued job whose predecessor is done.
 
-    None while a session is open, and while a job runs: one at a time leaves a core for acquisition.
+    None while a session is open or a job runs: running one job at a time leaves a core for acquisition.
     """
     if _is_open(state) or any(job.state == "running" for job in state.jobs):
         return None
@@ -168,7 +168,7 @@ def _is_spent(job: JobFacts, max_attempts: int) -> bool:
 
 
 def _is_being_compared(state: State, due: Sequence[Due]) -> bool:
-    """True if a comparison is under way or about to be queued: its outcome is waited for."""
+    """Return True if a comparison is pending or about to be queued, whose outcome must be known first."""
     return any(job.kind is JobKind.COMPARISON for job in state.jobs) or any(
         isinstance(item, DueChain) and JobKind.COMPARISON in item.kinds for item in due
     )
@@ -179,7 +179,7 @@ def _is_open(state: State) -> bool:
 
 
 def _is_covered(session: SessionFacts, kind: JobKind, state: State) -> bool:
-    """True if a job of this kind was queued after the session had been closed, and so works on it."""
+    """Return True if a job of this kind was queued after the session was closed, and so includes it."""
     return kind in state.covered and state.covered[kind] >= session.number
 
 
@@ -188,7 +188,7 @@ def _counts_for_drift(check: SessionFacts, state: State) -> bool:
 
 
 def _passed(since: Stamp | None, now: Stamp, seconds: float) -> bool:
-    """True if `seconds` have passed; across a reboot, or when a log is replayed once more, they have."""
+    """Return True if `seconds` have passed; always true after a reboot or when a log is replayed again."""
     if since is None or since.boot_id != now.boot_id:
         return True
     return not 0 <= now.monotonic_ns - since.monotonic_ns < seconds * NS_PER_S

@@ -1,1 +1,1 @@
-"""Model files, the live model and what it predicts."""
+"""Model files, the live model and its predictions."""

@@ -1,6 +1,6 @@
-"""Drift of the live model: two sums of its errors on check sessions say whether the machine has left it.
+"""Drift of the live model: two CUSUM statistics of its errors on check sessions show whether the machine has changed.
 
-The sums (`calibration.numerics.statistics`) begin anew whenever a model goes live, one that is put back included.
+The sums (`calibration.numerics.statistics`) restart whenever a model goes live, also by a rollback.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from daemon.store.queries.models import LiveRun, ModelTable
 def unseen_checks(
     models: ModelTable, run: LiveRun, checks: Sequence[tuple[int, str]], trained: Sequence[str]
 ) -> tuple[str, ...]:
-    """Return the check sessions that count for a run and were not held against its model yet.
+    """Return the check sessions that count for a live run and were not used to check its model for drift yet.
 
     Args:
         models: the table of the rig's models.
-        run: the live model's.
+        run: the run of the live model.
         checks: number and id of closed check sessions, oldest first.
         trained: sessions that the model was trained on.
     """
@@ -29,7 +29,7 @@ def unseen_checks(
 
 
 def note_drift(models: ModelTable, drift: Mapping[str, Any]) -> None:
-    """Add the result of a drift job, in the transaction of the caller; a session that is there already is kept."""
+    """Store the result of a drift job, in the caller's transaction; results of known sessions are not replaced."""
     since = drift["live_since"]
     for check in drift["checks"]:
         rows = models.drift_checks(since)
@@ -51,7 +51,7 @@ def note_drift(models: ModelTable, drift: Mapping[str, Any]) -> None:
 
 
 def drift_status(models: ModelTable) -> dict[str, Any] | None:
-    """Return the drift as `status` shows it; None where no model is live."""
+    """Return the drift as shown in `status`; None if no model is live."""
     run = models.live_run()
     if run is None:
         return None
@@ -75,11 +75,11 @@ def drift_status(models: ModelTable) -> dict[str, Any] | None:
 
 
 def gap_status(jobs: JobTable, models: ModelTable) -> dict[str, Any]:
-    """Return the gap between simulation and machine, as `status` shows it.
+    """Return the gap between simulation and machine, as shown in `status`.
 
     Returns:
-        `verdict`: of the newest gap job that has come to one, None before; `failed`: of a later one that has failed
-        `job`, `session` and `error`, None without; `drift`: as `drift_status`.
+        `verdict`: result of the newest gap job that is done, or None. `failed`: `job`, `session` and `error` of a later
+        gap job that failed, or None. `drift`: as from `drift_status`.
     """
     done, failed = (jobs.newest(JobKind.GAP, state) for state in ("done", "failed"))
     is_later = failed is not None and (done is None or failed["id"] > done["id"])
@@ -93,7 +93,7 @@ def gap_status(jobs: JobTable, models: ModelTable) -> dict[str, Any]:
 
 
 def _verdict(job: Mapping[str, Any] | None) -> dict[str, Any] | None:
-    if job is None or "gap" not in job["result"]:  # an identification from before there was a gap workflow has none
+    if job is None or "gap" not in job["result"]:  # identifications made before the gap workflow existed
         return None
     result = job["result"]
     return {

@@ -1,10 +1,10 @@
-"""The first load of a model, in a child process that may crash; `model_files` starts it and checks how it ends.
+"""The first load of a model, in a child process that may crash; `model_files` starts it and checks its exit status.
 
 Standard input carries the files: a line of JSON with their names and sizes, then their bytes. Exit status 0: the model
-loads and predicts; IS_NO_MODEL: it does not; CANNOT: this machine cannot tell (a system library is missing); the last
-line on standard error says why. A signal: the parser brought the process down.
+loads and predicts. IS_NO_MODEL: it does not. CANNOT: this computer cannot find out (a system library is missing). The
+last line on standard error is the reason. Death by a signal: the parser crashed.
 
-The process may take MEMORY_MAX_BYTES more than the program itself does; a model that needs more ends in a sentence.
+The process may use MEMORY_MAX_BYTES more than the program itself; a model that needs more is refused with an error.
 """
 
 from __future__ import annotations
@@ -29,17 +29,17 @@ MEMORY_MAX_BYTES = 400 << 20
 
 
 def encode(files: Mapping[str, bytes]) -> bytes:
-    """Files as `main` reads them."""
+    """Encode files, name -> content, in the format that `main` reads."""
     sizes = {name: len(data) for name, data in files.items()}
     return b"".join((json.dumps(sizes).encode("ascii"), b"\n", *files.values()))
 
 
 def main() -> int:
-    """Load the model on standard input and predict with it."""
+    """Load the model from standard input and predict with it; return the exit status."""
     sizes = json.loads(sys.stdin.buffer.readline())
     files = {name: sys.stdin.buffer.read(size) for name, size in sizes.items()}
     prepare()
-    # Imported before the limit, so that they count as the program's own memory.
+    # Imported before the limit is set, so that they count as the program's own memory.
     import calibration.model.files
     import calibration.model.prediction  # noqa: F401
 
@@ -56,9 +56,9 @@ def main() -> int:
 
 
 def limit_memory(more_bytes: int) -> None:
-    """Let this process take no more than so many bytes from now on: what asks for more gets a MemoryError.
+    """Limit how many more bytes this process may allocate from now on; beyond the limit a MemoryError is raised.
 
-    Where the system does not tell what it has taken (no /proc), nothing is limited.
+    Without /proc the memory in use is unknown, and no limit is set.
     """
     try:
         status = Path("/proc/self/status").read_text(encoding="ascii")
@@ -69,11 +69,14 @@ def limit_memory(more_bytes: int) -> None:
 
 
 def smoke_test(files: Mapping[str, bytes]) -> None:
-    """Load a model, and predict every prism at every set-up: between the joints' limits, and where it was trained.
+    """Load a model, and predict every prism at every set-up, in the middle of the joints' limits and where trained.
+
+    Args:
+        files: name -> content.
 
     Raises:
-        ModelError: the files are no model, or one that cannot predict.
-        CalibrationError: this machine lacks what loading it needs.
+        ModelError: the files are not a model, or the model cannot predict.
+        CalibrationError: this computer lacks something that loading needs.
     """
     from calibration.model.files import model_from_files
     from calibration.model.prediction import Predictor
@@ -86,17 +89,17 @@ def smoke_test(files: Mapping[str, bytes]) -> None:
         try:
             predicted = Predictor.of(model).predict(_rows(model.rig, poses, setup))
         except (CalibrationError, ArithmeticError, LookupError, TypeError, ValueError) as error:
-            # Infinite numbers, or parts that do not fit each other; predicting needs nothing of this machine.
+            # Infinite numbers or inconsistent parts: the fault is the model's, as predicting depends on no system part.
             reason = " ".join(str(error).split())
             raise ModelError(f"the model cannot predict ({reason}); restore it or calibrate again") from error
         if not max(np.abs(predicted.position_mm).max(), predicted.sigma_mm.max()) <= LARGEST:
             raise ModelError(
-                f"the model predicts positions or deviations beyond {LARGEST:.0e} mm; restore it or calibrate again"
+                f"the model predicts positions or sigmas beyond {LARGEST:.0e} mm; restore it or calibrate again"
             )
 
 
 def _rows(rig: Rig, poses: Floats, setup: str) -> Observations:
-    """Every prism at every pose, at one set-up."""
+    """Return rows of every prism at every pose, at one set-up."""
     n = len(poses) * len(rig.prism_names)
     return Observations(
         prism=np.repeat(np.array(rig.prism_names), len(poses)),

@@ -1,4 +1,4 @@
-"""The files of the gap workflow: its model, its report, its answer, and the poses that it asks for."""
+"""The files of the gap workflow: its model, report and answer, and the poses that it proposes."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ _LIST_SEPARATOR = " "
 
 
 def check_gap_target(directory: Path) -> None:
-    """Check that an answer may be written to `directory`: nothing is there, or the files of an earlier one.
+    """Check that an answer may be written to `directory`: it does not exist, or it holds only an earlier answer.
 
     Raises:
-        ModelError: something else is there that would be lost, or no directory can be made there.
+        ModelError: other files there would be lost, or the directory cannot be created.
     """
     require_place(directory)
     if directory.exists():
@@ -34,13 +34,18 @@ def check_gap_target(directory: Path) -> None:
         foreign = sorted({path.name for path in directory.iterdir()} - _NAMES)
         if foreign:
             raise ModelError(
-                f"{directory} holds {foreign[0]!r}, which is no part of a gap report; name another directory"
+                f"{directory} contains {foreign[0]!r}, which is not part of a gap report; name a different directory"
             )
         check_target(directory / MODEL)
 
 
 def gap_answer(gap: GapResult, seconds: float) -> dict[str, object]:
-    """Return the JSON object of `gap` (docs/reference/formats.md), with rounds and forecasts, as its report shows."""
+    """Return the JSON object of `gap` (docs/reference/formats.md), with the rounds and forecasts of its report.
+
+    Args:
+        gap: result of the workflow.
+        seconds: its duration.
+    """
     return {
         "rig": gap.model.rig.name,
         "n": len(gap.observations),
@@ -53,22 +58,22 @@ def gap_answer(gap: GapResult, seconds: float) -> dict[str, object]:
 
 
 def write_gap(directory: Path, gap: GapResult, answer: Mapping[str, object], report: str) -> str:
-    """Write model, report, answer and, where poses are asked for, the plan, in place of an earlier answer.
+    """Write model, report, answer and, if poses are proposed, the plan; replace an earlier answer atomically.
 
-    A reader sees the earlier answer or the new one, also where the disk is full in between.
+    A reader sees either the earlier answer or the new one, even if the disk fills up during the write.
 
     Args:
-        directory: where to; parents are made.
-        gap: what was found.
-        answer: as `gap_answer`, with what the caller adds to it.
+        directory: target; missing parents are created.
+        gap: result of the workflow.
+        answer: as from `gap_answer`, with additions of the caller.
         report: the HTML document.
 
     Returns:
-        SHA-256 of the model's manifest, which names it.
+        SHA-256 of the model's manifest, which identifies the model.
 
     Raises:
-        ModelError: `directory` holds something else, or the model does not load again.
-        OSError: the file system refuses.
+        ModelError: `directory` holds other files, or the written model cannot be loaded.
+        OSError: the files cannot be written.
     """
     check_gap_target(directory)
     texts = {REPORT: report, ANSWER: json_line(answer) + "\n"}
@@ -83,13 +88,13 @@ def write_gap(directory: Path, gap: GapResult, answer: Mapping[str, object], rep
 
 
 def next_poses(gap: GapResult) -> list[Mapping[str, object]]:
-    """The poses that the experiments ask for, as rows of a plan, numbered on."""
+    """Return the poses that the experiments propose, as rows of a plan, numbered from 1."""
     rows = [row for experiment in gap.experiments for row in experiment.poses]
     return [{**row, "pose": number} for number, row in enumerate(rows, start=1)]
 
 
 def poses_csv(rows: Sequence[Mapping[str, object]]) -> str:
-    """A plan's rows as `rigcal plan --out` writes them; an empty cell where a row lacks a column."""
+    """Return a plan's rows as CSV, as `rigcal plan --out` writes them; missing values are empty cells."""
     text = io.StringIO()
     writer = csv.DictWriter(text, list(dict.fromkeys(name for row in rows for name in row)), lineterminator="\n")
     writer.writeheader()

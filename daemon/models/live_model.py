@@ -1,7 +1,6 @@
-"""The live model in memory: loaded beside everything else, again whenever another one goes live.
+"""The live model in memory: loaded in the background, and again whenever a different model goes live.
 
-One that could not be loaded is looked at again now and then: what the computer lacked may be there, and its files may
-have been put right.
+Loading is retried periodically if it failed: a missing resource may be available again, or the files may be restored.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ log = logging.getLogger(__name__)
 
 NO_MODEL = "no model is live; `rigcal model list` shows the candidates"
 LOADING = "the live model is being loaded"
-RETRY_S = 30.0  # after a load that failed
+RETRY_S = 30.0  # after a failed load
 STOP_TIMEOUT_S = 5.0
 
 
@@ -34,8 +33,8 @@ class Loaded:
     Attributes:
         id: its number in the store.
         model: to predict with.
-        jumped: joints whose readings jumped since it was trained: their zeros are not those that it knows.
-        time_axis: that `time_s` of its training lies on, as it was when the model was loaded.
+        jumped: joints whose readings jumped since the model was trained, so that their zeros may differ from it.
+        time_axis: the axis of `time_s` in its training data, as of the time of loading.
     """
 
     id: int
@@ -46,12 +45,12 @@ class Loaded:
 
 @dataclass(frozen=True)
 class Missing:
-    """Why there is no live model to predict with.
+    """The reason why there is no live model to predict with.
 
     Attributes:
         reason: a sentence.
-        is_defect: a model is live and cannot be used.
-        is_hindered: that is for the computer's sake, and no fault of the model.
+        is_defect: whether a model is live but cannot be used.
+        is_hindered: whether the computer and not the model is the cause.
     """
 
     reason: str
@@ -64,11 +63,11 @@ class LiveModelHealth:
     """Faults of the live model.
 
     Attributes:
-        id: its number.
-        jumped: joints whose encoder has jumped since it was trained, their zeros not being checked.
-        defect: why it cannot be used; "" if it can, or that is not known.
-        hindrance: what keeps the computer from loading it; "" for nothing.
-        drifted_with: the check session with which it was found to have drifted; None before.
+        id: its number in the store.
+        jumped: joints whose encoder has jumped since the model was trained and whose zeros were not checked since.
+        defect: why the model cannot be used; "" if it can, or if that is unknown.
+        hindrance: what prevents the computer from loading it; "" if nothing does.
+        drifted_with: the check session that showed drift; None if there is no drift.
     """
 
     id: int
@@ -79,40 +78,40 @@ class LiveModelHealth:
 
 
 class LiveModel:
-    """Keeps the live model; asking for it never waits.
+    """Keeps the live model in memory; reading it never blocks.
 
     Args:
         table: the store's models.
-        rig: the machine, as its rig file describes it now.
+        rig: the machine, as described by the present rig file.
     """
 
     def __init__(self, table: ModelTable, rig: Rig) -> None:
         self._table, self._rig = table, rig
         self._state: Loaded | Missing = Missing(LOADING)
-        self._turn = threading.Lock()  # a state and whether it is out of date change together
+        self._turn = threading.Lock()  # guards the state together with the mark that it is out of date
         self._changed = threading.Event()
         self._changed.set()
         self._stopping = False
-        self._told = ""  # why it could not be loaded, as the log has it last
+        self._told = ""  # the last load error that was logged
         self._thread = threading.Thread(target=self._run, name="live-model", daemon=True)
 
     def start(self) -> None:
-        """Begin to load what is live."""
+        """Start to load the live model."""
         self._thread.start()
 
     def stop(self) -> None:
-        """Load no more. A load under way is not waited for beyond `STOP_TIMEOUT_S`."""
+        """Stop loading; wait at most `STOP_TIMEOUT_S` for a load in progress."""
         self._stopping = True
         self._changed.set()
         if self._thread.is_alive():
             self._thread.join(timeout=STOP_TIMEOUT_S)
 
     def now(self) -> Loaded | Missing:
-        """The live model, or why there is none; from any thread."""
+        """Return the live model, or the reason why there is none; from any thread."""
         return self._state
 
     def health(self) -> LiveModelHealth | None:
-        """Faults of the live model; None where none is live."""
+        """Return the faults of the live model; None if no model is live."""
         run = self._table.live_run()
         if run is None:
             return None
@@ -125,21 +124,21 @@ class LiveModel:
         return LiveModelHealth(run.model_id, (), defect, hindrance, drifted_with)
 
     def changed(self) -> None:
-        """Another model has gone live, or what is known of the joints' zeros has changed."""
+        """Load again, because a different model has gone live or what is known of the joints' zeros has changed."""
         with self._turn:
             self._state = Missing(LOADING)
             self._changed.set()
 
     def load(self, row: ModelRow) -> CalibratedModel:
-        """Read a model of the store, which another process has loaded when it was written.
+        """Read a model of the store; a child process loaded it successfully when it was written.
 
         Raises:
-            CalibrationError: it is damaged, edited, or made for another rig file.
+            CalibrationError: the model is damaged, edited, or made for a different rig file.
         """
         from daemon.warm_up import prepare
 
         prepare()
-        from daemon.models.model_files import read_model_of_rig  # what the mathematics needs takes a second to import
+        from daemon.models.model_files import read_model_of_rig  # numerical packages take a second to import
 
         return read_model_of_rig(row.path, row.manifest_sha256, self._rig)
 
@@ -163,19 +162,19 @@ class LiveModel:
                 return Missing(NO_MODEL)
             jumped = tuple(name for name in self._table.jumped(row) if name in self._rig.joint_names)
             loaded = Loaded(row.id, self.load(row), jumped, self._table.time_axis())
-        except Exception as error:  # noqa: BLE001 - logged, and shown as what it is
+        except Exception as error:  # noqa: BLE001 - logged, and shown as the state
             if self._stopping:
-                return Missing(LOADING)  # store and processes are going away under it: no defect of the model
+                return Missing(LOADING)  # store and processes are being stopped: not a defect of the model
             return self._failed(error)
         self._told = ""
         log.info("model %d is live", row.id)
         return loaded
 
     def _failed(self, error: Exception) -> Missing:
-        """Return why a model that is live could not be loaded, and tell the log once."""
+        """Return the reason why the live model could not be loaded, and log it once."""
         is_hindered = not isinstance(error, ModelError | UnsafeError)
         if is_hindered:
-            reason = f"the live model could not be loaded, which is tried again: {str(error) or type(error).__name__}"
+            reason = f"the live model could not be loaded and will be retried: {str(error) or type(error).__name__}"
         else:
             reason = f"the live model cannot be used: {error}"
         if reason != self._told:

@@ -1,9 +1,9 @@
-"""The present place of the tip: the latest joint readings through the live model, or why that is not known.
+"""The present position of the tip, predicted from the latest joint readings, or the reason why it is unknown.
 
-`on_records` runs in the writer's thread and only notes what the joiner knows of the machine; the model is asked in the
-threads of those who want to know. Every way in which a position could be wrong without looking so has a status of its
-own: no model, a model that cannot be used, readings that are old or bad, joints beyond their limits or with a zero that
-the model does not know, and poses beyond what it was trained on.
+`on_records` runs in the writer's thread and only notes the joiner's state of the machine; the model is evaluated in the
+callers' threads. Each way in which a position could be wrong without notice has its own status: no model, an unusable
+model, old or bad readings, joints beyond their limits or with a zero unknown to the model, and poses outside the
+training region.
 """
 
 from __future__ import annotations
@@ -30,33 +30,33 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-FRESH_S = 1.0  # readings older than this give no position
-_AHEAD_S = 0.1  # a reading's stamp may be this far ahead of the clock: a kernel's stamps are brought to it from another
-_BEYOND = 0.02  # of a joint's range: its zero may be off by so much
-_NO_STATION_MM = 1e-3  # the tip's own standard deviation is wanted, not that of a fix of it
+FRESH_S = 1.0  # older readings give no position
+_AHEAD_S = 0.1  # how far a timestamp may be ahead of the clock, as kernel timestamps are converted from another clock
+_BEYOND = 0.02  # tolerated excess over a joint's limits, as a share of its range: its zero may be off by this much
+_NO_STATION_MM = 1e-3  # negligible, so that the result is the standard deviation of the tip and not of a fix
 
 Place = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
 class Tip:
-    """The corrected place of a prism.
+    """The corrected position of a prism.
 
     Attributes:
-        status: what it is worth.
-        reason: why there is no position, a sentence; "" where there is one.
-        prism: whose place it is.
-        model: number of the live model; None where none is loaded.
-        utc_ns: the instant that it is of; None before all joints were read in this boot.
-        age_s: how long ago that was.
-        joints: the readings it follows from, by their observations column; angles on the turn of the joint's limits.
+        status: quality of the position.
+        reason: why there is no position, a sentence; "" if there is one.
+        prism: name of the prism.
+        model: number of the live model; None if none is loaded.
+        utc_ns: time of the position; None until all joints were read in this boot.
+        age_s: age of the position.
+        joints: observations column -> joint reading used; angles are on the turn of the joint's limits.
         base_mm: x, y, z in the base frame.
-        sigma_mm: RMS of the 3-D error to be expected: parameters, readings, timing, what the model lacks. The base
-            frame is the one that the calibration has placed before its stations.
-        setup: the set-up that the station stands in, where it has not moved and the model knows it.
-        station_mm, station_sigma_mm: x, y, z in that station's frame as it would measure them, with what its fixes err
-            by and how the base has moved, and their standard deviations.
-        warnings: what the model was not trained on.
+        sigma_mm: expected RMS of the 3-D error, from parameters, readings, timing and deficiencies of the model. The
+            base frame is the one that the calibration has placed relative to its stations.
+        setup: set-up of the station, if the station has not moved and the model knows the set-up.
+        station_mm, station_sigma_mm: x, y, z in that station's frame as it would measure them, including errors of its
+            fixes and movement of the base, and their standard deviations.
+        warnings: conditions that the model was not trained on.
     """
 
     status: TipStatus
@@ -83,16 +83,16 @@ class Tip:
 
 
 class LiveTip:
-    """The present place of any prism.
+    """The present position of any prism.
 
     Args:
         rig: the machine.
-        joiner: what is known of the joints; fed in the thread that calls `on_records`.
+        joiner: supplies the latest readings; fed in the thread that calls `on_records`.
         model: the live model.
-        setup: the set-up that the station stands in, None without one and where it has moved.
+        setup: returns the station's set-up; None if there is none or the station has moved.
         clock: for the readings' age.
-        prism: of `rigcal tip` where no other is named; None where none is configured.
-        fresh_s: readings older than this, on that clock, give no position.
+        prism: default prism of `rigcal tip`; None if none is configured.
+        fresh_s: readings older than this, in seconds of `clock`, give no position.
     """
 
     def __init__(
@@ -111,15 +111,15 @@ class LiveTip:
         self._is_failing = False
 
     def on_records(self, records: Sequence[Record]) -> None:
-        """Note what the joiner knows, which has these records already; costs next to nothing while no model is live."""
+        """Note the joiner's state, which includes these records already; cheap while no model is live."""
         joints = self._rig.joint_names
         if any(isinstance(r, DeviceEvent) and r.kind is EventKind.PRESET_JUMP and r.device in joints for r in records):
-            self._model.changed()  # the store knows of the jump by now
+            self._model.changed()  # the jump is in the store already
         if isinstance(self._model.now(), Loaded):
             self._state = self._joiner.latest()
 
     def tip_command(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the present place of a prism, by default the configured one."""
+        """Return the present position of a prism, by default the configured one."""
         prism = arguments.get("prism", self._prism)
         names = ", ".join(self._rig.prism_names)
         if prism is None:
@@ -129,13 +129,13 @@ class LiveTip:
         return self.tip(str(prism), self._setup()).as_dict()
 
     def tip(self, prism: str, setup: str | None = None) -> Tip:
-        """Return the present place of a prism; from any thread.
+        """Return the present position of a prism; from any thread.
 
         Args:
-            prism: of the rig.
-            setup: a set-up in whose station's frame the place is wanted, too.
+            prism: a prism of the rig.
+            setup: set-up for an additional position in its station's frame; None for none.
         """
-        # The state before the model: when it shows a jump, the model from before the jump is in use no more.
+        # Read the state before the model: once the state includes a jump, the model from before it is out of use.
         state = self._state
         live = self._model.now()
         if not isinstance(live, Loaded) or live.jumped or isinstance(state, str):
@@ -149,26 +149,26 @@ class LiveTip:
             return replace(known, status=TipStatus.OUT_OF_LIMITS, reason="; ".join(beyond))
         try:
             tip = _predicted(live, self._rig, state, known, setup)
-        except Exception as error:  # whatever fails, there is no position, and the receiver must know
+        except Exception as error:  # after any error there is no position, and the receiver must see that
             if not self._is_failing:
-                log.warning("the live model does not predict", exc_info=error)
+                log.warning("the prediction of the live model failed", exc_info=error)
             self._is_failing = True
-            return replace(known, status=TipStatus.FAILED, reason=f"the live model does not predict here: {error}")
+            return replace(known, status=TipStatus.FAILED, reason=f"the prediction of the live model failed: {error}")
         self._is_failing = False
         return tip
 
     def _as_read(self, state: MachineState, prism: str, model: int) -> Tip:
-        """The readings and their age, with no place yet; STALE where they are not of now."""
+        """Return the readings and their age, without a position yet; STALE if they are not current."""
         now = self._clock.now()
         joints = _readings(self._rig, state)
-        if now.boot_id != state.boot_id:  # the joiner is fed with what a killed run left undecoded, too
-            reason = "the joints were last read before the computer was started anew; is the bus silent?"
+        if now.boot_id != state.boot_id:  # the joiner also gets captures that a killed run left undecoded
+            reason = "the joints were last read before the computer was restarted; is the bus silent?"
             return Tip(TipStatus.STALE, reason, prism, model, joints=joints)
         old_ns = now.monotonic_ns - state.monotonic_ns
         age_s = old_ns / NS_PER_S
         known = Tip(TipStatus.OK, "", prism, model, now.utc_ns - old_ns, age_s, joints)
         if age_s < -_AHEAD_S:
-            reason = f"the joints' readings are {-age_s:.1f} s ahead of the clock; what stamps {state.oldest}?"
+            reason = f"the joint readings are {-age_s:.1f} s ahead of the clock; check the timestamps of {state.oldest}"
             return replace(known, status=TipStatus.STALE, reason=reason)
         if age_s > self._fresh_s:
             reason = f"the joints were last read together {age_s:.1f} s ago; is {state.oldest} silent?"
@@ -177,12 +177,12 @@ class LiveTip:
 
 
 def _unknown(live: Loaded | Missing, state: MachineState | str, prism: str) -> Tip:
-    """Return a tip that says why nothing can be predicted with this model and these readings."""
+    """Return a tip with the reason why this model and these readings give no prediction."""
     if not isinstance(live, Loaded):
         return Tip(TipStatus.MODEL_UNUSABLE if live.is_defect else TipStatus.NO_MODEL, live.reason, prism)
     if live.jumped:
         reason = (
-            f"{', '.join(live.jumped)} jumped since the live model was trained; check the zero, then say so with "
+            f"{', '.join(live.jumped)} jumped since the live model was trained; check the zero, then confirm it with "
             "`rigcal model zeros-checked`, or calibrate again"
         )
         return Tip(TipStatus.ZERO_LOST, reason, prism, live.id)
@@ -213,26 +213,26 @@ def _predicted(live: Loaded, rig: Rig, state: MachineState, known: Tip, setup: s
 
 
 def _travelled(model: CalibratedModel) -> Iterator[str]:
-    """A doubt about every effect that one instant does not tell."""
+    """Yield a warning for each effect that depends on travel, which one instant does not determine."""
     from calibration.effects.library import library
 
     for effect in model.effects:
         if library()[effect.family].depends_on_travel:
             yield (
-                f"{effect.family}@{effect.where} grows with the path that {effect.where} travels, which is not known "
-                f"since the training: calibrate again where that is much"
+                f"{effect.family}@{effect.where} grows with the distance that {effect.where} travels, which is unknown "
+                f"since the training; calibrate again if it has travelled far"
             )
 
 
 def _readings(rig: Rig, state: MachineState) -> dict[str, float]:
-    """Column -> the joint's reading, on the turn that training saw it on."""
+    """Return column -> joint reading, on the same turn as in training."""
     read = {joint.name: np.array([state.values[joint.column]]) for joint in rig.joints}
     turned = on_one_turn(rig, read)
     return {joint.column: float(turned[joint.name][0]) for joint in rig.joints}
 
 
 def _observation(live: Loaded, rig: Rig, state: MachineState, known: Tip, setup: str) -> Observations:
-    """One row as training saw it: the joints, and whatever else is known of the machine."""
+    """Return one row in the form of the training data: the joints, and all else that is known of the machine."""
     joints = {joint.name: np.array([known.joints[joint.column]]) for joint in rig.joints}
     extra = {name: np.array([value]) for name, value in state.values.items() if name not in known.joints}
     if state.dwell_s is not None:
@@ -254,7 +254,7 @@ def _observation(live: Loaded, rig: Rig, state: MachineState, known: Tip, setup:
 
 
 def _beyond(joint: Joint, value: float) -> str:
-    """Say how a reading lies outside the joint's limits; "" inside them."""
+    """Return a clause about a reading outside the joint's limits; "" if it is inside."""
     if not beyond_limits(joint, np.array([value]), _BEYOND).any():
         return ""
     low, high = joint.limits

@@ -1,8 +1,8 @@
-"""Model directories: written whole or not at all, read only after their first load has gone well in another process.
+"""Model directories: written atomically, and read only after a child process has loaded them successfully.
 
-A model is a handful of files under a manifest (`calibration.model.files`). Whatever they may hold, no process of value
-parses a model that a child has not parsed before it. That takes a second or two: a model whose sum was kept when it
-was written is not parsed by another child.
+A model is a few files listed in a manifest (`calibration.model.files`). Whatever they contain, no important process
+parses a model that a child process has not parsed before. This takes a second or two, so it is skipped for a model
+whose checksum was stored when it was written.
 """
 
 from __future__ import annotations
@@ -31,23 +31,23 @@ from daemon.store.errors import LACKING
 from drivers.files import read_whole
 
 REPORT = "report.html"
-COMPANIONS = frozenset({REPORT})  # may lie beside the model's files, outside its manifest
+COMPANIONS = frozenset({REPORT})  # files that may be in a model directory without being in the manifest
 CHECK_TIMEOUT_S = 120.0
-_MODEL_MAX_BYTES = 64 << 20  # all files together; the most trees that are ever grown take 20 MB
+_MODEL_MAX_BYTES = 64 << 20  # all files together; the largest possible forest takes 20 MB
 _MANIFEST_MAX_BYTES = 1 << 20
 _FILES_MAX = 32
 _FILE_NAME = re.compile(r"\w[\w.-]{0,99}", re.ASCII)
 _AT_FDCWD = -100
 _RENAME_EXCHANGE = 2
 
-_checked: set[str] = set()  # manifests of models that a child of this process has loaded
+_checked: set[str] = set()  # manifest checksums of models that a child of this process has loaded
 
 
 def check_target(directory: Path) -> None:
-    """Check that a model may be written to `directory`: nothing there, an empty directory, or a model to be replaced.
+    """Check that a model may be written to `directory`: it does not exist, is empty, or holds a model to be replaced.
 
     Raises:
-        ModelError: something else is there that would be lost, or no directory can be made there.
+        ModelError: other files there would be lost, or the directory cannot be created.
     """
     require_place(directory)
     if not directory.exists():
@@ -58,45 +58,50 @@ def check_target(directory: Path) -> None:
     if not found:
         return
     if MANIFEST not in found:
-        raise ModelError(f"{directory} is neither empty nor a model directory; name another one")
+        raise ModelError(f"{directory} is neither empty nor a model directory; name a different directory")
     foreign = sorted(found - set(_listed(directory)) - COMPANIONS - {MANIFEST})
     if foreign:
-        raise ModelError(f"{directory} holds {foreign[0]!r}, which is no part of the model there; move it away first")
+        raise ModelError(f"{directory} contains {foreign[0]!r}, which is not part of its model; move that file first")
 
 
 def require_place(directory: Path) -> None:
-    """Raise ModelError where no directory can be made, or put in the place of one that is there."""
+    """Raise ModelError if the directory can be neither created nor replaced."""
     nearest = next(path for path in directory.resolve().parents if path.exists())
     if not nearest.is_dir() or not os.access(nearest, os.W_OK):
-        reason = "may not be written to" if nearest.is_dir() else "is a file"
-        raise ModelError(f"{directory} cannot be made, as {nearest} {reason}; name another directory")
+        reason = "is not writable" if nearest.is_dir() else "is a file"
+        raise ModelError(f"{directory} cannot be created, because {nearest} {reason}; name a different directory")
 
 
 def check_loads(model: CalibratedModel, directory: Path) -> None:
-    """Let a child process load a model that is to be written to a directory, so that `write_model` need not.
+    """Let a child process load a model in advance, so that `write_model` need not do so.
+
+    Args:
+        model: to be written later.
+        directory: its target, for error messages.
 
     Raises:
-        ModelError: the model does not load.
+        ModelError: the model cannot be loaded.
     """
     _check_in_child(model_to_files(model), directory.resolve())
 
 
 def write_model(directory: Path, model: CalibratedModel, companions: Mapping[str, bytes] | None = None) -> str:
-    """Write a model directory; a model already there is replaced in one step, so that a reader sees one or the other.
+    """Write a model directory; replace an existing model atomically, so that a reader sees the old or the new one.
 
-    The new files are loaded by a child process, written beside the directory, flushed to disk, and renamed.
+    The new files are loaded by a child process, written to a temporary directory next to the target, flushed to disk,
+    and renamed.
 
     Args:
-        directory: where to; parents are made.
-        model: what to write.
-        companions: files to lie beside the model's, of the names in `COMPANIONS`.
+        directory: target; missing parents are created.
+        model: the model to write.
+        companions: name -> content of additional files, with names in `COMPANIONS`.
 
     Returns:
-        SHA-256 of the manifest, which names the model.
+        SHA-256 of the manifest, which identifies the model.
 
     Raises:
-        ModelError: `directory` holds something else, or the model does not load again.
-        OSError: the file system refuses.
+        ModelError: `directory` holds other files, or the model cannot be loaded.
+        OSError: the files cannot be written.
     """
     directory = directory.resolve()
     check_target(directory)
@@ -110,10 +115,10 @@ def write_model(directory: Path, model: CalibratedModel, companions: Mapping[str
 
 @contextlib.contextmanager
 def replaced_whole(directory: Path) -> Iterator[Path]:
-    """A new directory beside `directory`, which takes its place in one step when the block ends well.
+    """Yield a new directory, which atomically replaces `directory` when the block ends without an error.
 
     Raises:
-        OSError: the file system refuses; `directory` is as it was.
+        OSError: the files cannot be written; `directory` is unchanged.
     """
     directory = directory.resolve()
     directory.parent.mkdir(parents=True, exist_ok=True)
@@ -127,19 +132,19 @@ def replaced_whole(directory: Path) -> Iterator[Path]:
 
 
 def read_model(directory: Path, manifest_sha256: str | None = None) -> CalibratedModel:
-    """Read a model directory; one that this process meets without its sum is loaded by a child process first.
+    """Read a model directory; without a checksum, the model is first loaded by a child process.
 
     Args:
-        directory: the model's.
-        manifest_sha256: which model is meant, as `write_model` gave it once a child had loaded that model; whichever is
-            there when not given.
+        directory: of the model.
+        manifest_sha256: expected checksum of the manifest, as returned by `write_model` after a child had loaded the
+            model; None to accept any model.
 
     Raises:
-        ModelError: not a model, truncated, edited, of another version, or it brings down the process that loads it.
-        CalibrationError: this machine lacks what loading it needs, or its disk fails.
+        ModelError: not a model, truncated, edited, of a different version, or it crashes the process that loads it.
+        CalibrationError: this computer lacks something that loading needs, or its disk fails.
     """
     if not directory.is_dir():
-        raise ModelError(f"{directory} is not a directory; name the one that calibrate wrote")
+        raise ModelError(f"{directory} is not a directory; name a model directory, as written by `rigcal calibrate`")
     if not (directory / MANIFEST).is_file():
         raise ModelError(f"{directory} is not a model directory: it has no {MANIFEST}")
     files: dict[str, bytes] = {}
@@ -159,24 +164,29 @@ def read_model(directory: Path, manifest_sha256: str | None = None) -> Calibrate
 
 
 def read_model_of_rig(directory: Path, manifest_sha256: str, rig: Rig) -> CalibratedModel:
-    """Read the model that a store knows, for use on a rig.
+    """Read a model of a store, for use on a rig.
+
+    Args:
+        directory: of the model.
+        manifest_sha256: checksum of its manifest in the store.
+        rig: the rig that the model is to be used on.
 
     Raises:
         CalibrationError: as `read_model`.
-        UnsafeError: it was made for another rig file: names, joints, rows, limits or channels differ.
-            Comments and signals may.
+        UnsafeError: the model was made for a different rig file: names, joints, rows, limits or channels differ.
+            Comments and signals may differ.
     """
     model = read_model(directory, manifest_sha256)
     if model.rig.differences(rig):
         raise UnsafeError(
-            f"{directory} was made for another rig file (of {model.rig.name!r}) than the one in use (of {rig.name!r}), "
-            "and they differ in what they describe; calibrate with this one, or go back to that one"
+            f"{directory} was made for a rig file (of {model.rig.name!r}) that describes a different machine than the "
+            f"one in use (of {rig.name!r}); calibrate with the one in use, or go back to the earlier file"
         )
     return model
 
 
 def model_sha256(directory: Path) -> str:
-    """SHA-256 of the manifest, which names the model; ModelError if there is none."""
+    """Return the SHA-256 of the manifest, which identifies the model; ModelError if there is no manifest."""
     data = _read(directory, MANIFEST, _MANIFEST_MAX_BYTES)
     if data is None:
         raise ModelError(f"{directory} is not a model directory: it has no {MANIFEST}")
@@ -184,21 +194,21 @@ def model_sha256(directory: Path) -> str:
 
 
 def _listed(directory: Path) -> list[str]:
-    """Names of the files in the manifest, which need not be sound otherwise."""
+    """Return the file names in the manifest, whose other content is not checked."""
     try:
         names = list(json.loads(_read(directory, MANIFEST, _MANIFEST_MAX_BYTES) or b"")["files"])
     except (ValueError, KeyError, TypeError, RecursionError, MemoryError) as error:
         raise ModelError(f"{directory}: {MANIFEST} is damaged; restore the model, or remove it") from error
     if len(names) > _FILES_MAX:
-        raise ModelError(f"{directory}: {MANIFEST} lists {len(names)} files, a model has {_FILES_MAX} at most")
+        raise ModelError(f"{directory}: {MANIFEST} lists {len(names)} files; a model has at most {_FILES_MAX}")
     for name in names:
         if not (isinstance(name, str) and _FILE_NAME.fullmatch(name)):
-            raise ModelError(f"{directory}: {MANIFEST} lists {name!r}, which is no file name; this is not a model")
+            raise ModelError(f"{directory}: {MANIFEST} lists {name!r}, which is not a file name; this is not a model")
     return names
 
 
 def _read(directory: Path, name: str, most_bytes: int) -> bytes | None:
-    """The file's bytes; None if there is none; as `read_model` where it is no part of a model, or cannot be read."""
+    """Return the file's bytes; None if there is no file; raise as `read_model` if it is unsuitable or unreadable."""
     path = directory / name
     if path.exists() and not path.is_file():
         raise ModelError(f"{directory}: {name} is not a regular file; this is not a model")
@@ -220,14 +230,14 @@ def _sha256(data: bytes) -> str:
 
 
 def _check_in_child(files: Mapping[str, bytes], directory: Path) -> None:
-    """Let a fresh process load the files and predict with them; an error in one sentence if that ends badly."""
+    """Let a new process load the files and predict with them; raise an error if it fails."""
     key = _sha256(files[MANIFEST])
     if key in _checked:
         return
-    # -P keeps the current directory off the child's path: what lies there is no code of ours.
+    # -P keeps the current directory off the module search path, so that no file there is imported.
     command = [sys.executable, "-P", "-m", "daemon.models.first_load"]
     try:
-        # In a session of its own: a Ctrl-C that is meant for this process would look like a model that kills the child.
+        # A new session keeps Ctrl-C from the child, where it would look like a model that crashes its process.
         child = subprocess.run(
             command,
             input=encode(files),
@@ -240,7 +250,7 @@ def _check_in_child(files: Mapping[str, bytes], directory: Path) -> None:
         raise ModelError(f"{directory}: loading the model did not end within {CHECK_TIMEOUT_S:g} s") from error
     if child.returncode < 0:
         name = signal.Signals(-child.returncode).name
-        raise ModelError(f"{directory}: the model kills the process that loads it ({name}); restore it")
+        raise ModelError(f"{directory}: the model crashes the process that loads it ({name}); restore it")
     if child.returncode != 0:
         lines = child.stderr.decode("utf-8", "replace").strip().splitlines() or ["no reason given"]
         kind = ModelError if child.returncode == IS_NO_MODEL else CalibrationError
@@ -249,20 +259,20 @@ def _check_in_child(files: Mapping[str, bytes], directory: Path) -> None:
 
 
 def _put_in_place(new: Path, target: Path) -> None:
-    """Rename `new` to `target`; what was at `target` then lies in `new`'s directory, or is gone if it was empty."""
+    """Rename `new` to `target`; the old target moves into the parent of `new`, or is gone if it was empty."""
     try:
         new.rename(target)
     except OSError as error:
         if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
             raise
         if not _exchange(new, target):
-            # A file system that cannot swap (NFS, some FUSE): for an instant a reader may find nothing.
+            # The file system cannot exchange (NFS, some FUSE): for an instant a reader may find no directory.
             target.rename(new.with_name("old"))
             new.rename(target)
 
 
 def _exchange(one: Path, other: Path) -> bool:
-    """Swap two directories in one step (Linux, renameat2(2)); False where the file system cannot."""
+    """Exchange two directories atomically (Linux, renameat2(2)); return False if the file system cannot."""
     libc = ctypes.CDLL(None, use_errno=True)
     if libc.renameat2(_AT_FDCWD, os.fsencode(one), _AT_FDCWD, os.fsencode(other), _RENAME_EXCHANGE) == 0:
         return True

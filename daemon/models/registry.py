@@ -1,8 +1,9 @@
-"""Which model is live, and the operator's commands about it.
+"""The live model and the operator's commands about models.
 
-A candidate goes live only when it beats the live model on held-out sessions beyond chance and an operator accepts it;
-a first model must not be worse there than the nominal one. Any model that was live can be put back. Before either, the
-model's files are checked against their manifest, and its sum against the store, and it is loaded.
+A candidate goes live only if it is significantly better than the live model on held-out sessions and an operator
+accepts it. A first model must not be worse there than the nominal model. Any model that was live can be restored by a
+rollback. Before a model goes live, its files are verified against their manifest, the manifest's checksum against the
+store, and the model is loaded.
 """
 
 from __future__ import annotations
@@ -28,13 +29,13 @@ class ModelRegistry:
 
     Args:
         table: the store's models.
-        rig_name: whose models go live.
+        rig_name: rig whose models can go live.
         live: the model in use.
-        compare: queues the comparison of a model with the live one, and says so.
-        comparison_job: tells the job that is yet to compare a model; None without one.
-        comparison_after: tells the job that is yet to compare the model which a later stage makes of a model, and the
-            job that makes it; None without one.
-        zeros_checked: stores what follows from an operator's word about the joints' zeros.
+        compare: queues the comparison of a model with the live one, and returns a sentence about it.
+        comparison_job: returns the pending job that will compare a model; None if there is none.
+        comparison_after: returns the pending job that will compare the model which a later stage makes from a model,
+            and the job that makes it; None if there is none.
+        zeros_checked: stores the consequences of an operator's confirmation of the joints' zeros.
     """
 
     def __init__(
@@ -51,31 +52,31 @@ class ModelRegistry:
         self._table, self._rig, self._live = table, rig_name, live
         self._compare, self._comparison_job, self._comparison_after = compare, comparison_job, comparison_after
         self._zeros_checked = zeros_checked
-        # The candidate that was last loaded for `status`, its files as they lay there, and why it cannot go live.
+        # The candidate that was last loaded for `status`, the state of its files then, and why it cannot go live.
         self._loaded: tuple[tuple[int, _Files], str | None] | None = None
 
     # ---- commands of the operator ------------------------------------------------------------------------------------
 
     def list_command(self, _arguments: Mapping[str, Any]) -> list[dict[str, Any]]:
-        """All models, oldest first."""
+        """Return all models, oldest first."""
         live = self._table.live()
         return [_brief(model, live) for model in self._table.all()]
 
     def show_command(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
-        """One model, the live one by default, with its comparison and every change of its state."""
+        """Return a model, by default the live one, with its comparison and all changes of its state."""
         model = self._wanted(arguments)
         return model.as_dict() | {"history": self._table.history(model)}
 
     def compare_command(self, arguments: Mapping[str, Any]) -> str:
-        """Compare a model with the one that is live now, on all check sessions."""
+        """Compare a model with the present live model, on all check sessions."""
         return self._compare(self._own(self._table.get(arguments.get("id"))))
 
     def accept_command(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
-        """Make a candidate the live model, if it has shown on held-out sessions that it is better."""
+        """Make a candidate the live model, if it was better on held-out sessions."""
         model = self._own(self._table.get(arguments.get("id")))
         if model.state != "candidate":
             is_back = model.state == "retired" and self._table.was_live(model)
-            also = f"; `rigcal model rollback {model.id}` puts it back" if is_back else ""
+            also = f"; `rigcal model rollback {model.id}` makes it live again" if is_back else ""
             raise CommandError(f"model {model.id} is {model.state}; only a candidate can be accepted{also}")
         live = self._table.live()
         reason = self._reason_to_accept(model, live)
@@ -83,52 +84,53 @@ class ModelRegistry:
         return self._changed(model, live) | {"reason": reason}
 
     def reject_command(self, arguments: Mapping[str, Any]) -> str:
-        """Retire a candidate, so that nobody accepts it by mistake; the reason is kept."""
+        """Retire a candidate, so that nobody accepts it by mistake; the reason is stored."""
         model = self._own(self._table.get(arguments.get("id")))
         reason = text_argument(arguments, "reason").strip()
         if not reason:
-            raise CommandError(f"say why model {model.id} is rejected: the reason is kept with it")
+            raise CommandError(f"give a reason for rejecting model {model.id}; it is stored with the model")
         operator = text_argument(arguments, "operator")
         if model.state != "candidate" or not self._table.reject(
             model, f"rejected: {reason}", operator=operator, **caller_columns()
         ):
-            raise CommandError(f"model {model.id} is {self._table.get(model.id).state}; only a candidate is rejected")
-        log.warning("model %d is rejected (%s), by %s", model.id, reason, operator or "an operator without a name")
+            state = self._table.get(model.id).state
+            raise CommandError(f"model {model.id} is {state}; only a candidate can be rejected")
+        log.warning("model %d was rejected by %s: %s", model.id, operator or "an unnamed operator", reason)
         return f"model {model.id} is rejected"
 
     def rollback_command(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
-        """Put back the model that the live one replaced, or any other that was live."""
+        """Make the predecessor of the live model live again, or any other model that was live before."""
         live = self._table.live()
         wanted = arguments.get("id")
         if wanted is None:
             if live is None:
-                raise CommandError("no model is live, so none can be rolled back; `rigcal model list` shows all")
+                raise CommandError("no model is live, so there is nothing to roll back; see `rigcal model list`")
             wanted = self._table.predecessor(live)
             if wanted is None:
                 others = [m.id for m in self._table.all() if m.state == "retired" and self._table.was_live(m)]
-                instead = f"name another, as `rigcal model rollback {others[-1]}`" if others else "accept a better one"
-                raise CommandError(f"model {live.id} is the first that went live, and replaced none; {instead}")
+                instead = f"name one, as `rigcal model rollback {others[-1]}`" if others else "accept a better model"
+                raise CommandError(f"model {live.id} was the first to go live and has no predecessor; {instead}")
         model = self._own(self._table.get(wanted))
         if model.state != "retired" or not self._table.was_live(model):
             why = {
-                "live": "is live already",
-                "candidate": "was never live; `rigcal model accept` makes it so",
-                "retired": "was rejected, and never live",
+                "live": "is already live",
+                "candidate": "was never live; `rigcal model accept` makes it live",
+                "retired": "was rejected and never live",
             }[model.state]
             raise CommandError(f"model {model.id} {why}")
         self._make_live(model, live, arguments, "put back")
         return self._changed(model, live)
 
     def zeros_checked_command(self, arguments: Mapping[str, Any]) -> str:
-        """Take the operator's word that the joints' zeros are those that a model was trained with.
+        """Record the operator's confirmation that the joints' zeros are those that a model was trained with.
 
-        It is the live one, or, where none is, the newest that waits to be accepted.
+        The model is the live model, or the newest candidate if none is live.
         """
         model = self._table.live() or self._table.waiting()
         if model is None:
             raise CommandError(
-                "there is no model yet whose zeros they could be; `rigcal session accept ID` says of each session that "
-                "it was measured with the present ones"
+                "there is no model yet whose zeros could be confirmed; `rigcal session accept ID` confirms for a "
+                "session that it was measured with the present zeros"
             )
         jumped = self._table.jumped(model)
         operator = text_argument(arguments, "operator")
@@ -137,16 +139,16 @@ class ModelRegistry:
             self._table.note_zeros_checked(model, through, operator=operator, **caller_columns())
             self._zeros_checked()
         self._live.changed()
-        told = f"jumps until now count no more: {', '.join(jumped) or 'there were none'}"
-        return f"model {model.id} is used again; {told}" if model.state == "live" else f"model {model.id}: {told}"
+        told = f"earlier jumps are now ignored: {', '.join(jumped) or 'there were none'}"
+        return f"model {model.id} is in use again; {told}" if model.state == "live" else f"model {model.id}: {told}"
 
     def status(self) -> dict[str, Any]:
-        """Return the live model, and the newest candidate that waits to be accepted, for `status`."""
+        """Return the live model and the newest candidate, for `status`."""
         live, waiting = self._table.live(), self._table.waiting()
         return {"live": live and _brief(live, live), "candidate": waiting and self._candidate(waiting, live)}
 
     def _candidate(self, model: ModelRow, live: ModelRow | None) -> dict[str, Any]:
-        """A model that waits, with whether `accept_command` would take it now, and why it would not."""
+        """Return a candidate, with whether `accept_command` would accept it now and, if not, the reason."""
         refusal: str | None = None
         try:
             self._reason_to_accept(model, live)
@@ -162,12 +164,12 @@ class ModelRegistry:
             return self._table.get(arguments["id"])
         live = self._table.live()
         if live is None:
-            raise CommandError("no model is live; name one by its number, `rigcal model list` shows them")
+            raise CommandError("no model is live; give the number of a model from `rigcal model list`")
         return live
 
     def _own(self, model: ModelRow) -> ModelRow:
         if model.rig != self._rig:
-            raise CommandError(f"model {model.id} is of rig {model.rig!r}, and this is rig {self._rig!r}", REFUSED)
+            raise CommandError(f"model {model.id} is of rig {model.rig!r}, but this is rig {self._rig!r}", REFUSED)
         return model
 
     def _make_live(self, model: ModelRow, live: ModelRow | None, arguments: Mapping[str, Any], reason: str) -> None:
@@ -175,10 +177,10 @@ class ModelRegistry:
         self._load(model)
         if not self._table.go_live(model, live, reason, operator=operator, **caller_columns()):
             raise CommandError(
-                "another command or comparison changed the models meanwhile; look again with `rigcal model list`",
+                "the models were changed in the meantime by another command or comparison; check `rigcal model list`",
                 REFUSED,
             )
-        log.warning("model %d is live (%s), by %s", model.id, reason, operator or "an operator without a name")
+        log.warning("model %d was made live by %s: %s", model.id, operator or "an unnamed operator", reason)
         self._live.changed()
 
     def _load(self, model: ModelRow) -> None:
@@ -188,7 +190,7 @@ class ModelRegistry:
             raise CommandError(f"model {model.id} cannot go live: {error}", REFUSED) from error
 
     def _require_loads(self, model: ModelRow) -> None:
-        """As `_load`, which takes a second, but once for the model's files as they lie there."""
+        """Do as `_load`, which takes a second, but only once for the same state of the model's files."""
         files = model.id, _files(model.path)
         loaded = self._loaded
         if loaded is None or loaded[0] != files:
@@ -204,25 +206,25 @@ class ModelRegistry:
             raise CommandError(loaded[1], REFUSED)
 
     def _reason_to_accept(self, model: ModelRow, live: ModelRow | None) -> str:
-        """Why a candidate may go live; CommandError, refused, where it may not."""
+        """Return the reason why a candidate may go live; raise CommandError (REFUSED) if it may not."""
         compared = model.comparison
         is_stale = compared is not None and _is_stale(compared, live)
-        again = f"; `rigcal model compare {model.id}` compares it anew"
+        again = f"; `rigcal model compare {model.id}` compares it again"
         if (compared is None or is_stale) and (job := self._comparison_job(model)) is not None:
-            again = f"; job {job} is yet to compare it: wait for that job"
+            again = f"; wait for job {job}, which will compare it"
         elif compared is None and (later := self._comparison_after(model)) is not None:
             job, maker = later
-            again = f"; job {job} compares the model that job {maker} makes of the same sessions: wait for that one"
+            again = f"; wait for job {job}, which will compare the model that job {maker} makes of the same sessions"
         elif compared is None:
             again = f": hold a check session (`rigcal session start --kind check`){again}"
         if compared is None:
-            raise CommandError(f"model {model.id} was not compared with held-out data yet{again}", REFUSED)
+            raise CommandError(f"model {model.id} was not compared on held-out data yet{again}", REFUSED)
         if is_stale:
             now = f"model {live.id} is live now" if live else "none is live now"
             then = "no model was live" if compared["live"] is None else f"model {compared['live']} was live"
-            raise CommandError(f"model {model.id} was compared when {then}, and {now}{again}", REFUSED)
+            raise CommandError(f"model {model.id} was compared when {then}, but {now}{again}", REFUSED)
         if not compared["is_better"]:
-            raise CommandError(f"model {model.id} does not go live: {compared['sentence']}", REFUSED)
+            raise CommandError(f"model {model.id} cannot go live: {compared['sentence']}", REFUSED)
         return str(compared["sentence"])
 
     def _changed(self, model: ModelRow, live: ModelRow | None) -> dict[str, Any]:
@@ -230,12 +232,12 @@ class ModelRegistry:
 
 
 def _is_stale(compared: Mapping[str, Any], live: ModelRow | None) -> bool:
-    """True if a comparison is with another model than the one that is live."""
+    """Return True if a comparison was with a model that is not the present live model."""
     return bool(compared["live"] != (live and live.id))
 
 
 def _files(directory: Path) -> _Files:
-    """Name, size and time of change of a model's files; nothing where they cannot be looked at."""
+    """Return name, size and modification time of a model's files; empty if they cannot be listed."""
     try:
         return tuple(sorted((e.name, e.stat().st_size, e.stat().st_mtime_ns) for e in os.scandir(directory)))
     except OSError:

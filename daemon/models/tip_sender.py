@@ -1,4 +1,4 @@
-"""Sends the live tip over CAN, where the configuration says so."""
+"""Sends the live tip over CAN, if configured."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ STOP_TIMEOUT_S = 5.0
 
 
 class TipSender(threading.Thread):
-    """One thread that sends the tip at a fixed rate, its status too where there is no position.
+    """A thread that sends the tip at a fixed rate; without a position it sends only the status.
 
     Args:
-        tip: where the prism is.
-        section: which prism, and how often.
-        can: under which identifiers.
-        link: where to.
+        tip: the present position.
+        section: prism and rate.
+        can: CAN identifiers.
+        link: CAN link to send on.
     """
 
     def __init__(self, tip: LiveTip, section: TipSection, can: TipCanSection, link: CanLink) -> None:
@@ -28,13 +28,13 @@ class TipSender(threading.Thread):
         self._stopping = threading.Event()
 
     def stop(self) -> None:
-        """Send no more."""
+        """Stop sending."""
         self._stopping.set()
         if self.is_alive():
             self.join(timeout=STOP_TIMEOUT_S)
 
     def run(self) -> None:
-        """Send at the fixed rate until stopped; where it may not be sent, the thread ends, which is an alarm."""
+        """Send at the fixed rate until stopped; if sending is forbidden, the thread ends, which raises an alarm."""
         counter = 0
         while not self._stopping.wait(1.0 / self._section.rate_hz):
             message = self._tip.tip(self._section.prism).message()

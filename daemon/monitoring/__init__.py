@@ -1,1 +1,1 @@
-"""Metrics, and notices of alarms, for people who are elsewhere."""
+"""Metrics, and notices of alarms, for people who are not at the machine."""

@@ -1,4 +1,4 @@
-"""Ways in which a message leaves the machine: a webhook, and a command that sends an e-mail."""
+"""Targets that deliver messages from the machine: a webhook, and a command that sends an e-mail."""
 
 from __future__ import annotations
 
@@ -24,19 +24,19 @@ from daemon.host.systemd import network_hint
 from daemon.monitoring.notice import Message
 from drivers.clock import NS_PER_S, SystemClock
 
-WEBHOOK_TIMEOUT_S = 10.0  # of a delivery as a whole, as that of a command
+WEBHOOK_TIMEOUT_S = 10.0  # for a whole delivery, as COMMAND_TIMEOUT_S
 COMMAND_TIMEOUT_S = 30.0
-_QUOTED = 200  # characters of what a server or a command says
-_KEPT_BYTES = 4096  # of the end of what a command says
-_PIPE_BYTES = 65536  # that a pipe holds
+_QUOTED = 200  # characters of a server's or a command's output in an error message
+_KEPT_BYTES = 4096  # of the end of a command's output
+_PIPE_BYTES = 65536  # capacity of a pipe
 
 
 class DeliveryError(Exception):
-    """A message that was not delivered; the text says why, and holds no secret of the configuration."""
+    """A message was not delivered; the text is the reason, without secrets of the configuration."""
 
 
 class Target(Protocol):
-    """A way out of the machine."""
+    """A target of notices."""
 
     @property
     def name(self) -> str:
@@ -46,18 +46,18 @@ class Target(Protocol):
         """Deliver a message, or raise DeliveryError."""
 
     def cancel(self) -> None:
-        """Give up a delivery that is under way, from another thread; harmless when there is none."""
+        """Cancel a delivery in progress, from a different thread; harmless if there is none."""
 
 
 class _NoRedirect(urllib.request.HTTPRedirectHandler):
-    """Makes an error of a redirection: a POST that follows one arrives as a GET, without its message."""
+    """Treats a redirection as an error: a POST that follows it would become a GET without the message."""
 
     def redirect_request(self, *_arguments: Any, **_more: Any) -> None:
         return None
 
 
 class _Connection(http.client.HTTPConnection):
-    """Tells of its socket as soon as there is one, also where TLS begins on it afterwards."""
+    """Passes its socket to `opened` as soon as it is connected, before TLS starts."""
 
     opened: Callable[[socket.socket], None]
 
@@ -67,11 +67,11 @@ class _Connection(http.client.HTTPConnection):
 
 
 class _TlsConnection(http.client.HTTPSConnection, _Connection):
-    """Calls `_Connection.connect`, then begins TLS."""
+    """Calls `_Connection.connect`, then starts TLS."""
 
 
 class _Handler(urllib.request.HTTPHandler, urllib.request.HTTPSHandler):
-    """Opens connections that tell of their sockets."""
+    """Opens connections that pass their sockets to `opened`."""
 
     def __init__(self, opened: Callable[[socket.socket], None]) -> None:
         super().__init__()
@@ -90,11 +90,11 @@ class _Handler(urllib.request.HTTPHandler, urllib.request.HTTPSHandler):
 
 
 class _Post(threading.Thread):
-    """A request that is given up as a whole: a time-out of urllib is one for each read, and a byte starts it anew.
+    """A request with a timeout for the whole request; the timeout of urllib restarts with every read.
 
     Args:
         request: to be sent.
-        longest_s: how long it may take from the name's look-up to the end of the answer.
+        longest_s: timeout from the look-up of the host name to the end of the answer.
     """
 
     def __init__(self, request: urllib.request.Request, longest_s: float) -> None:
@@ -106,12 +106,12 @@ class _Post(threading.Thread):
         self._error: Exception | None = None
 
     def send(self) -> None:
-        """Send it and wait for the answer; raises what urllib raises, and TimeoutError after `longest_s`."""
+        """Send the request and wait for the answer; raises the errors of urllib, and TimeoutError after `longest_s`."""
         self.start()
         self.join(self._longest_s)
         if self.is_alive():
             self._give_up()
-            raise TimeoutError(f"no whole answer within {self._longest_s:g} s")
+            raise TimeoutError(f"no complete answer within {self._longest_s:g} s")
         if self._error is not None:
             raise self._error
 
@@ -120,7 +120,7 @@ class _Post(threading.Thread):
         try:
             with opener.open(self._request, timeout=self._longest_s) as answer:
                 answer.read(_QUOTED)
-        except Exception as error:  # noqa: BLE001 - raised by `send`, in the thread that waits
+        except Exception as error:  # noqa: BLE001 - raised by `send` in the waiting thread
             self._error = error
         finally:
             with self._turn:
@@ -130,7 +130,7 @@ class _Post(threading.Thread):
 
     def _opened(self, line: socket.socket) -> None:
         with self._turn:
-            self._lines.append(line.dup())  # TLS takes the socket itself away
+            self._lines.append(line.dup())  # a duplicate, as TLS takes over the socket itself
         if self._is_over:
             self._give_up()
 
@@ -143,10 +143,10 @@ class _Post(threading.Thread):
 
 
 class Webhook:
-    """Posts a message as JSON; its key `text` is what chat services show.
+    """Posts a message as JSON; chat services show its key `text`.
 
     Args:
-        url: http or https. It may hold a secret, and is never told.
+        url: http or https. It may contain a secret, and is never logged or shown.
     """
 
     name = "webhook"
@@ -170,13 +170,13 @@ class Webhook:
             raise DeliveryError(f"{self._host}: {_reason(error)}") from None
 
     def cancel(self) -> None:
-        """Do nothing: it ends by its own time-out."""
+        """Do nothing: the delivery ends by its timeout."""
 
 
 class Command:
-    """Gives a message to a command on its standard input, as an e-mail without recipients (RFC 5322).
+    """Passes a message to a command on standard input, as an e-mail without recipients (RFC 5322).
 
-    The message is kept in memory, not in a file: a full disk is told of too.
+    The message is kept in memory and not in a file, so that an alarm about a full disk can be sent.
 
     Args:
         arguments: the program and its arguments, without a shell.
@@ -198,7 +198,7 @@ class Command:
                 given.seek(0)
                 with self._turn:
                     if self._is_cancelled:
-                        raise DeliveryError("rigcal is being stopped")
+                        raise DeliveryError("rigcal is stopping")
                     self._process = subprocess.Popen(
                         self._arguments,
                         stdin=given,
@@ -215,9 +215,9 @@ class Command:
             raise DeliveryError(f"{program} ended with status {status}" + (f": {last}" if last else ""))
 
     def _last_said(self, process: subprocess.Popen[bytes]) -> bytes:
-        """Wait for the end of a process, and return the last of what it said: it may say gigabytes.
+        """Wait for the end of a process and return the end of its output, which may be gigabytes.
 
-        What it has left running may hold its output open, so the end of the process counts, not that of the output.
+        Children that it leaves running may keep its output open, so wait for the process and not for its output.
         """
         assert process.stdout is not None
         clock = SystemClock()
@@ -255,7 +255,7 @@ class Command:
 
 @contextlib.contextmanager
 def _end_of(process: subprocess.Popen[bytes]) -> Iterator[int]:
-    """A descriptor that is readable once a process has ended."""
+    """Yield a descriptor that becomes readable when a process has ended."""
     end = os.pidfd_open(process.pid)
     try:
         yield end
@@ -266,7 +266,7 @@ def _end_of(process: subprocess.Popen[bytes]) -> Iterator[int]:
 def _email(message: Message) -> bytes:
     email = EmailMessage()
     email["Subject"] = message.subject
-    email["Auto-Submitted"] = "auto-generated"  # RFC 3834: no holiday notice answers it
+    email["Auto-Submitted"] = "auto-generated"  # RFC 3834: suppresses automatic replies
     email.set_content(message.text, cte="8bit")
     return bytes(email)
 

@@ -1,8 +1,8 @@
-"""Metrics in Prometheus' form, made of the daemon's status: one state, two forms.
+"""Metrics in Prometheus format, derived from the daemon's status.
 
-Each family says how its samples follow from the object that `rigcal status --json` prints. Nothing is counted here.
-Names and units are those of https://prometheus.io/docs/practices/naming/. Ages are given in place of times where the
-status has them by the monotonic clock, which nobody can set.
+Each family defines how its samples follow from the object that `rigcal status --json` prints. Nothing is counted here.
+Names and units follow https://prometheus.io/docs/practices/naming/. Ages are given in place of timestamps where the
+status measures them on the monotonic clock, which cannot be set.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 Status = Mapping[str, Any]
-# Values of a family's labels, and the sample's value; None: there is no such sample at present.
+# Values of a family's labels, and the sample's value; None if there is no such sample at present.
 Sample = tuple[tuple[str, ...], float | None]
 
 
@@ -23,9 +23,9 @@ class Family:
     Attributes:
         name: counters end in `_total`.
         kind: gauge or counter.
-        help: what it is, a sentence.
-        labels: their names.
-        samples: makes its samples of a status.
+        help: description, one sentence.
+        labels: names of its labels.
+        samples: returns its samples, given a status.
     """
 
     name: str
@@ -114,7 +114,7 @@ FAMILIES: tuple[Family, ...] = (
     Family(
         "rigcal_build_info",
         "gauge",
-        "Always 1; the labels say what runs.",
+        "Always 1; the labels show version, rig and mode.",
         ("version", "rig", "mode"),
         lambda s: [((s["version"], s["rig"], s["mode"]), 1.0)],
     ),
@@ -122,7 +122,7 @@ FAMILIES: tuple[Family, ...] = (
     Family(
         "rigcal_link_up",
         "gauge",
-        "1 while the link's port is open; absent before its first word.",
+        "1 while the link's port is open; absent until the link has reported its state.",
         ("link",),
         lambda s: (((link["name"],), _is(link["up"])) for link in s["acquisition"]["links"]),
     ),
@@ -136,21 +136,21 @@ FAMILIES: tuple[Family, ...] = (
     Family(
         "rigcal_link_queue_length",
         "gauge",
-        "Captures of a link that wait to be stored.",
+        "Captures of a link that are waiting to be stored.",
         ("link",),
         _links("queued"),
     ),
     Family(
         "rigcal_link_queue_dropped_total",
         "counter",
-        "Captures of a link that found the queue to the store full and were lost.",
+        "Captures of a link that were lost because the queue to the store was full.",
         ("link",),
         _links("dropped"),
     ),
     Family(
         "rigcal_link_restarts_total",
         "counter",
-        "How often the loop that reads a link failed and was started again.",
+        "How often the loop that reads a link failed and was restarted.",
         ("link",),
         _links("restarts"),
     ),
@@ -160,7 +160,7 @@ FAMILIES: tuple[Family, ...] = (
     Family(
         "rigcal_can_frames_missed_total",
         "counter",
-        "CAN frames that did not arrive, by the counter that frames of this identifier carry.",
+        "Missing CAN frames, detected by the counter in frames with this identifier.",
         ("link", "identifier"),
         lambda s: (((f["link"], f["identifier"]), f["missed"]) for f in s["acquisition"]["frames"]),
     ),
@@ -168,29 +168,29 @@ FAMILIES: tuple[Family, ...] = (
     Family(
         "rigcal_gap_open_seconds",
         "gauge",
-        "How long a gap has lasted that has not closed.",
+        "Duration of a gap that is still open.",
         ("channel", "reason"),
         lambda s: (((g["channel"], g["reason"]), g["age_s"]) for g in s["acquisition"]["gaps"]),
     ),
     Family(
         "rigcal_gaps_total",
         "counter",
-        "Stretches in which a channel, station or link gave nothing, by reason.",
+        "Periods without data from a channel, station or link, by reason.",
         ("channel", "reason"),
         _gap_counts("count"),
     ),
     Family(
         "rigcal_gap_missed_total",
         "counter",
-        "Readings or frames that are missing in these gaps, as far as that could be told. For a link and the reason "
-        "frames_lost: all that kernel, adapter or a full queue dropped.",
+        "Readings or frames missing in these gaps, as far as known. For a link and the reason frames_lost: all that "
+        "the kernel, the adapter or a full queue dropped.",
         ("channel", "reason"),
         _gap_counts("missed"),
     ),
     Family(
         "rigcal_decode_failures_total",
         "counter",
-        "Captures of a device that could not be decoded; they are stored.",
+        "Captures of a device that could not be decoded; the captures are kept.",
         ("device",),
         lambda s: (((device,), n) for device, n in s["acquisition"]["decode_failures"].items()),
     ),
@@ -219,7 +219,7 @@ FAMILIES: tuple[Family, ...] = (
     Family(
         "rigcal_station_locked",
         "gauge",
-        "1 while a station follows a prism; absent while it is not heard, or does not say.",
+        "1 while a station is locked to a prism; absent while the station is silent or does not report its lock.",
         ("station",),
         _stations(lambda one: None if one["lock"] == "unknown" else float(one["lock"] == "locked")),
     ),
@@ -243,8 +243,8 @@ FAMILIES: tuple[Family, ...] = (
     Family(
         "rigcal_station_latency_seconds",
         "gauge",
-        "Latency of the station's fixes against the joints' readings beyond link_delay_s, of the newest session that "
-        "told it.",
+        "Latency of the station's fixes relative to the joint readings in addition to link_delay_s, from the newest "
+        "session that determined it.",
         ("session",),
         _latency("seconds"),
     ),
@@ -266,7 +266,7 @@ FAMILIES: tuple[Family, ...] = (
     Family(
         "rigcal_decoding_behind",
         "gauge",
-        "1 while captures wait in the store to be decoded.",
+        "1 while captures in the store are waiting to be decoded.",
         (),
         _one(lambda s: _is(s["acquisition"]["is_behind"])),
     ),
@@ -280,7 +280,7 @@ FAMILIES: tuple[Family, ...] = (
     Family(
         "rigcal_store_sound",
         "gauge",
-        "0 where the store is damaged, replaced or gone.",
+        "0 if the store is damaged, replaced or missing.",
         (),
         _one(lambda s: float(s["store_health"]["state"] in ("ok", "checking"))),
     ),
@@ -295,7 +295,7 @@ FAMILIES: tuple[Family, ...] = (
     Family(
         "rigcal_clock_synchronized",
         "gauge",
-        "1 while a time service keeps the computer's clock; absent where nothing tells.",
+        "1 while a time service synchronises the computer's clock; absent if unknown.",
         (),
         _one(lambda s: _is(_clock(s).get("is_synchronized"))),
     ),
@@ -309,7 +309,7 @@ FAMILIES: tuple[Family, ...] = (
     Family(
         "rigcal_clock_max_error_seconds",
         "gauge",
-        "Greatest error that the computer's clock may have, as its time service or the kernel tells.",
+        "Largest possible error of the computer's clock, as reported by its time service or the kernel.",
         (),
         _one(lambda s: _clock(s).get("max_error_s")),
     ),
@@ -339,7 +339,7 @@ FAMILIES: tuple[Family, ...] = (
     Family(
         "rigcal_control_point_misclosure_meters",
         "gauge",
-        "Distance of a control point's newest shot from its known place, current set-up.",
+        "Distance of a control point's newest shot from its known position, for the current set-up.",
         ("setup", "point"),
         _misclosures,
     ),
@@ -360,21 +360,21 @@ FAMILIES: tuple[Family, ...] = (
     Family(
         "rigcal_model_candidate_acceptable",
         "gauge",
-        "1 while a model waits for an operator to accept it.",
+        "1 while a model is waiting for an operator to accept it.",
         (),
         _one(_candidate),
     ),
     Family(
         "rigcal_check_error_ratio",
         "gauge",
-        "RMS error of the live model in the newest check session, over its formal sigma; about 1 when all is well.",
+        "RMS error of the live model in the newest check session divided by its formal sigma; about 1 if all is well.",
         (),
         _one(lambda s: _drift(s).get("ratio")),
     ),
     Family(
         "rigcal_check_drift_ratio",
         "gauge",
-        "Accumulated evidence that the machine has left the live model; at 1 it has.",
+        "Accumulated evidence that the machine has drifted from the live model, relative to the threshold for drift.",
         (),
         _one(_drift_sum),
     ),
@@ -383,28 +383,28 @@ FAMILIES: tuple[Family, ...] = (
     Family(
         "rigcal_alarm_active",
         "gauge",
-        "1 for each active alarm; docs/reference/alarms.md has the kinds.",
+        "1 for each active alarm; docs/reference/alarms.md lists the kinds.",
         ("kind", "subject", "severity"),
         lambda s: (((a["kind"], a["subject"], a["severity"]), 1.0) for a in s["alarms"]["active"]),
     ),
     Family(
         "rigcal_alarms_looked_age_seconds",
         "gauge",
-        "Time since alarms were last looked at; above a few seconds the daemon is held up.",
+        "Time since alarms were last evaluated; the daemon is blocked if this exceeds a few seconds.",
         (),
         _one(lambda s: s["alarms"]["looked_age_s"]),
     ),
     Family(
         "rigcal_notices_waiting",
         "gauge",
-        "Notices of alarms that are not delivered yet, by the way they go.",
+        "Notices of alarms that are not delivered yet, by target.",
         ("target",),
         _notices("waiting"),
     ),
     Family(
         "rigcal_notice_messages_total",
         "counter",
-        "Messages of notices that were delivered.",
+        "Messages with notices that were delivered.",
         ("target",),
         _notices("sent"),
     ),

@@ -1,4 +1,4 @@
-"""Serves the metrics on the loopback interface, by the official client of Prometheus."""
+"""Serves the metrics on the loopback interface, with the official Prometheus client."""
 
 from __future__ import annotations
 
@@ -24,21 +24,21 @@ STOP_S = 5.0
 
 
 class StatusCollector:
-    """Makes metrics of the daemon's status at every scrape.
+    """Converts the daemon's status to metrics at every scrape.
 
     Args:
-        status: returns it; called in the thread of a scrape.
+        status: returns the status; called in the thread of a scrape.
     """
 
     def __init__(self, status: Callable[[], Status]) -> None:
         self._status = status
 
     def describe(self) -> list[Metric]:
-        """Return nothing: a registry need not ask for the status to know its names."""
+        """Return nothing, so that the registry does not need the status to know the names."""
         return []
 
     def collect(self) -> Iterator[Metric]:
-        """Yield every family with the samples that there are."""
+        """Yield every family with its present samples."""
         from prometheus_client.metrics_core import CounterMetricFamily, GaugeMetricFamily
 
         status = self._status()
@@ -53,10 +53,10 @@ class StatusCollector:
 
 
 class MetricsServer:
-    """Serves `/metrics` on a port of the loopback interface; a port that is taken is tried again.
+    """Serves `/metrics` on a port of the loopback interface; if the port is in use, it is retried.
 
     Args:
-        port: to listen on; 0 for any that is free.
+        port: to listen on; 0 for any free port.
         status: returns the daemon's status.
     """
 
@@ -67,7 +67,7 @@ class MetricsServer:
         self._registry = CollectorRegistry(auto_describe=False)
         self._registry.register(StatusCollector(status))
         ProcessCollector(registry=self._registry)
-        self._clock = SystemClock()  # ports and people wait in real time
+        self._clock = SystemClock()  # retries are in real time
         self._next_ns = 0
         self._served: tuple[ScrapeServer, threading.Thread] | None = None
         self._trouble: str | None = None
@@ -75,24 +75,24 @@ class MetricsServer:
 
     @property
     def port(self) -> int | None:
-        """The port that is served; None while there is none."""
+        """The port that is served; None while no port is open."""
         return None if self._served is None else self._served[0].server_port
 
     def trouble(self) -> str | None:
-        """Return why nobody can read the metrics, a clause; None where all is well."""
+        """Return why the metrics cannot be read, a clause; None if they can."""
         if self._served is None:
             return self._trouble
         server, thread = self._served
         return server.trouble if thread.is_alive() else "the thread that serves the metrics has ended"
 
     def look(self) -> None:
-        """Begin to serve where that has not succeeded yet; to be called now and then."""
+        """Start to serve if that has not succeeded yet; to be called periodically."""
         now_ns = self._clock.monotonic_ns()
         if self._served is not None or now_ns < self._next_ns:
             return
         try:
             self._served = self._begun()
-        except (OSError, RuntimeError) as error:  # the system has no thread to give
+        except (OSError, RuntimeError) as error:  # RuntimeError: no thread can be started
             self._next_ns = now_ns + round(RETRY_S * NS_PER_S)
             was_told = self._trouble is not None
             reason = error.strerror if isinstance(error, OSError) else error
@@ -116,7 +116,7 @@ class MetricsServer:
         return server, thread
 
     def stop(self) -> None:
-        """Serve no more."""
+        """Stop serving."""
         if self._served is not None:
             server, thread = self._served
             server.shutdown()

@@ -1,4 +1,4 @@
-"""A notice of an alarm, and the message that tells people elsewhere of one or of many."""
+"""A notice of an alarm, and the message that carries one or more notices."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from daemon.host.safe_output import duration, shown
 from drivers.clock import NS_PER_S, Stamp
 
 Severity = Literal["warning", "critical"]
-LISTED = 30  # in one message; older ones are counted
+LISTED = 30  # notices in one message; older ones are only counted
 
 
 @dataclass(frozen=True)
 class Notice:
-    """Something that happened to an alarm.
+    """An event of an alarm.
 
     Attributes:
-        event: raised; cleared; test: an operator wants to see whether notices arrive.
+        event: raised, cleared, or test, which an operator requests to see whether notices arrive.
         kind, subject, severity, text, remedy: of the alarm.
-        raised: when it was noticed.
-        at: when the event was.
+        raised: when the alarm was raised.
+        at: time of the event.
     """
 
     event: Literal["raised", "cleared", "test"]
@@ -37,17 +37,17 @@ class Notice:
 
     @property
     def key(self) -> tuple[str, str]:
-        """Kind and subject, which make it this alarm."""
+        """Kind and subject, which identify the alarm."""
         return self.kind, self.subject
 
     @property
     def title(self) -> str:
-        """The event and its alarm, a few words."""
+        """The event and its alarm, in a few words."""
         first = {"raised": self.severity.upper(), "cleared": "over:", "test": "test:"}[self.event]
         return shown(f"{first} {self.kind} {self.subject}")
 
     def line(self) -> str:
-        """The whole notice in one line for people."""
+        """Return the whole notice in one line, for people."""
         at = datetime.fromtimestamp(self.at.utc_ns / NS_PER_S, UTC)
         if self.event == "cleared":
             what = f"{self.text} (over after {duration(self.at.since(self.raised) / NS_PER_S)})"
@@ -56,7 +56,7 @@ class Notice:
         return shown(f"{at:%Y-%m-%d %H:%M:%S} UTC {self.title}: {what}")
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the notice as a JSON object, as webhooks and commands get it."""
+        """Return the notice as a JSON object, as sent to webhooks."""
         return {
             "event": self.event,
             "kind": self.kind,
@@ -75,8 +75,8 @@ class Message:
 
     Attributes:
         subject: one line.
-        text: the notices, a line each.
-        data: the same for programs; the keys `text` and `notices` among others.
+        text: the notices, one per line.
+        data: the same for programs, with the keys `text` and `notices` among others.
     """
 
     subject: str
@@ -85,12 +85,12 @@ class Message:
 
 
 def message_of(rig: str, notices: Sequence[Notice], unlisted: int = 0) -> Message:
-    """Return the message that tells of notices.
+    """Return the message about notices.
 
     Args:
         rig: name of the machine.
-        notices: at least one, oldest first; the newest are listed.
-        unlisted: how many older ones there are besides.
+        notices: at least one, oldest first; the newest `LISTED` are listed.
+        unlisted: number of additional, older notices.
     """
     host = socket.gethostname()
     listed, total = notices[-LISTED:], len(notices) + unlisted

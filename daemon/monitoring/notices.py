@@ -1,4 +1,4 @@
-"""Notices: alarms that leave the machine, by a thread of their own that nothing waits for."""
+"""Notices: alarms that are sent from the machine, by a separate thread that nothing waits for."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from drivers.clock import Clock
 log = logging.getLogger(__name__)
 
 STOP_S = 5.0
-REWRITE_S = 5.0  # between two attempts to write to a store that cannot be written
+REWRITE_S = 5.0  # between attempts to write to a store that cannot be written
 
 
 class Notices:
-    """Tells every target what happens to alarms.
+    """Sends events of alarms to all targets.
 
     Args:
-        section: where notices go; where it is absent, nothing is kept and nothing is sent.
-        table: of the store.
-        active: the alarms that an earlier run has left active, as rows.
+        section: targets of notices; None to store and send nothing.
+        table: the store's table of notices.
+        active: rows of the alarms that an earlier run left active.
         rig: name of the machine.
-        clock: of the store's instants.
-        pace: how often messages are sent; as docs/reference/alarms.md says by default.
+        clock: for times in the store.
+        pace: how often messages are sent; the default is described in docs/reference/alarms.md.
     """
 
     def __init__(
@@ -54,18 +54,18 @@ class Notices:
         self._inbox: list[Notice] = []
         self._changed = threading.Condition()
         self._is_stopping = False
-        self._is_told = False  # that the store cannot be written
-        self._fault = ""  # of the thread itself
+        self._is_told = False  # whether it was logged that the store cannot be written
+        self._fault = ""  # last error of the thread itself
         self._thread = threading.Thread(target=self._run, name="notices", daemon=True)
         self._status = [outbox.status() for outbox in self._outboxes]
 
     def start(self) -> None:
-        """Begin to send."""
+        """Start to send."""
         if self._outboxes:
             self._thread.start()
 
     def stop(self) -> None:
-        """Send no more; what waits is in the store for the next start."""
+        """Stop sending; pending notices stay in the store for the next start."""
         with self._changed:
             self._is_stopping = True
             self._changed.notify()
@@ -75,28 +75,28 @@ class Notices:
             self._thread.join(STOP_S)
 
     def take(self, notice: Notice) -> None:
-        """Take a notice; from any thread, at once."""
+        """Queue a notice; from any thread, without waiting."""
         if self._outboxes:
             with self._changed:
                 self._inbox.append(notice)
                 self._changed.notify()
 
     def try_command(self, _arguments: Mapping[str, Any]) -> str:
-        """Send a notice that is no alarm, to see whether notices arrive."""
+        """Send a test notice, to see whether notices arrive."""
         if not self._outboxes:
-            raise CommandError("no notices are sent: the configuration has no [notify]")
+            raise CommandError("no notices are sent: the configuration has no section [notify]; add it")
         now, caller = self._clock.now(), current_caller()
-        text = f"asked for by {caller}" if caller is not None else "asked for"
+        text = f"requested by {caller}" if caller is not None else "requested"
         self.take(Notice("test", "test", "notices", "warning", text, "Nothing is wrong.", now, now))
         names = " and ".join(outbox.target.name for outbox in self._outboxes)
-        return f"a test notice goes out by {names}; `rigcal status` shows if it does not arrive"
+        return f"a test notice is being sent by {names}; `rigcal status` shows if it cannot be delivered"
 
     def status(self) -> list[dict[str, Any]]:
-        """Return for each target `target`, `waiting`, `sent`, `failures` and `error`."""
+        """Return `target`, `waiting`, `sent`, `failures` and `error` of each target."""
         return self._status
 
     def faults(self) -> dict[str, str]:
-        """Targets whose last delivery failed, all of them where this part has failed itself -> why."""
+        """Return target -> error of its last delivery if that failed; all targets if the thread itself has failed."""
         errors = {one["target"]: self._fault or one["error"] for one in self._status}
         return {target: error for target, error in errors.items() if error}
 
@@ -108,14 +108,14 @@ class Notices:
         self._go_on(self._take_in)
 
     def _go_on(self, work: Callable[[], None]) -> None:
-        """Do something; a fault of rigcal must not keep the alarms of months from leaving the machine."""
+        """Do a step and go on after any error, as an error of rigcal must not stop notices for months."""
         try:
             work()
             self._fault = ""
         except Exception as error:
             fault = f"{type(error).__name__}: {error}"
             if fault != self._fault:
-                log.exception("the thread that sends notices has failed; it goes on")
+                log.exception("the thread that sends notices has failed and will try again")
             self._fault = fault
             with self._changed:
                 self._changed.wait_for(lambda: self._is_stopping, REWRITE_S)
@@ -142,7 +142,7 @@ class Notices:
         self._write()
 
     def _patience_s(self) -> float | None:
-        """Return how long the thread may sleep; None until it is woken."""
+        """Return how long the thread may sleep, seconds; None to sleep until it is woken."""
         waits = [due for outbox in self._outboxes if (due := outbox.due_in_s()) is not None]
         if not all(outbox.is_written for outbox in self._outboxes):
             waits.append(REWRITE_S)
@@ -154,14 +154,14 @@ class Notices:
                 outbox.write()
         except Exception:
             if not self._is_told:
-                log.warning("notices cannot be written to the store; they are sent all the same", exc_info=True)
+                log.warning("notices cannot be written to the store; they are still sent", exc_info=True)
             self._is_told = True
         else:
             self._is_told = False
 
 
 def targets_of(section: NotifySection) -> list[Target]:
-    """Return where notices go by a configuration."""
+    """Return the configured targets of notices."""
     targets: list[Target] = []
     if section.webhook_url is not None:
         targets.append(Webhook(section.webhook_url))

@@ -1,7 +1,6 @@
-"""Notices for one target: kept in memory and in the store until they were delivered.
+"""Notices for one target: kept in memory and in the store until they are delivered.
 
-A notice shows that it waits although the store cannot be written: it is sent all the same, and its row is written once
-it can be.
+If the store cannot be written, notices are still sent, and their rows are written as soon as possible.
 """
 
 from __future__ import annotations
@@ -20,19 +19,19 @@ from drivers.clock import NS_PER_S, Clock, Stamp, SystemClock
 log = logging.getLogger(__name__)
 
 HOUR_S = 3600.0
-STALE_NS = 7 * 24 * 3600 * NS_PER_S  # nobody needs to be told any more of what is older when rigcal starts
-WAITING_MAX = 1000  # in memory; older ones are counted
+STALE_NS = 7 * 24 * 3600 * NS_PER_S  # pending notices older than this at start-up are not sent any more
+WAITING_MAX = 1000  # pending notices in memory; older ones are only counted
 
 
 @dataclass(frozen=True)
 class Pace:
-    """Pace at which a target is told, in real time.
+    """Pace at which messages are sent to a target, in real time.
 
     Attributes:
-        gather_s: what is to be told is gathered for so long: one fault often raises several alarms.
-        first_retry_s: pause after a delivery that failed; it doubles with every further one.
+        gather_s: how long notices are collected for one message, as one fault often raises several alarms.
+        first_retry_s: pause after a failed delivery; it doubles with each further failure.
         longest_retry_s: the longest pause.
-        per_hour: how many messages an hour at most; what comes beyond waits, and is told in one.
+        per_hour: most messages in an hour; further notices wait, and are sent in one message.
     """
 
     gather_s: float = 3.0
@@ -46,22 +45,22 @@ USUAL = Pace()
 
 @dataclass
 class _Entry:
-    """A notice, and its number in the store; None while it is not written."""
+    """A notice and its row id in the store, which is None until it is written."""
 
     notice: Notice
     row: int | None = None
 
 
 class Outbox:
-    """The notices of one target. Belongs to one thread.
+    """The notices of one target; for use by a single thread.
 
     Args:
-        target: where they go.
-        table: of the store.
+        target: delivers the notices.
+        table: the store's table of notices.
         rig: name of the machine.
-        clock: of the store's instants.
+        clock: for times in the store.
         pace: how often messages are sent.
-        least: alarms below this severity are not told.
+        least: lowest severity of alarms that are sent.
     """
 
     def __init__(
@@ -69,15 +68,15 @@ class Outbox:
     ) -> None:
         self.target = target
         self._table, self._rig, self._clock, self._pace, self._least = table, rig, clock, pace, least
-        self._real = SystemClock()  # networks and people wait in real time, whatever the rig's clock does
+        self._real = SystemClock()  # pauses are in real time; the rig's clock may run at a different rate
         now = clock.now()
         rows = table.waiting(target.name, now.utc_ns - STALE_NS, WAITING_MAX)
         self._waiting = [_Entry(_notice(row), row["id"]) for row in rows]
-        # Alarms that were told, or wait to be, and are not over
+        # Alarms whose notices were sent or are pending, and that have not cleared
         self._uncleared = {notice.key: notice for notice in map(_notice, table.uncleared(target.name))}
         self._unlisted = 0
-        self._unwritten: list[tuple[Notice, Stamp]] = []  # sent before the store took them
-        self._sent_through: tuple[int, Stamp] | None = None  # what the store is still to know
+        self._unwritten: list[tuple[Notice, Stamp]] = []  # sent but not yet in the store
+        self._sent_through: tuple[int, Stamp] | None = None  # sent up to this row; not yet in the store
         self._retry_s = pace.first_retry_s
         self._due_ns = self._real.monotonic_ns() if self._waiting else None
         hour_ago_ns = now.utc_ns - round(HOUR_S * NS_PER_S)
@@ -86,14 +85,14 @@ class Outbox:
         self._sent = self._failures = 0
         self._error: str | None = None
 
-    # ---- what is to be told ------------------------------------------------------------------------------------------
+    # ---- pending notices ---------------------------------------------------------------------------------------------
 
     def reconcile(self, alarms: Sequence[Mapping[str, Any]], now: Stamp) -> None:
-        """Add what was never queued because the daemon was killed: alarms that stand, and alarms that are over.
+        """Add notices that were never queued because the daemon was killed, of active and of cleared alarms.
 
         Args:
-            alarms: those that are active by the store, as rows.
-            now: this instant.
+            alarms: rows of the alarms that are active in the store.
+            now: current time.
         """
         active = [_notice({**row, "event": "raised", "at": row["raised"]}) for row in alarms]
         for notice in active:
@@ -106,7 +105,7 @@ class Outbox:
                 self.add(replace(uncleared, event="cleared", at=now))
 
     def add(self, notice: Notice) -> None:
-        """Take a notice, if this target is to be told of it."""
+        """Queue a notice, unless this target does not need it."""
         uncleared = self._uncleared.get(notice.key)
         if notice.event == "raised":
             if notice.severity != "critical" and self._least == "critical":
@@ -129,12 +128,12 @@ class Outbox:
 
     @property
     def is_written(self) -> bool:
-        """True if the store has all of it."""
+        """True if all changes are in the store."""
         has_new = any(entry.row is None for entry in self._waiting)
         return not (has_new or self._unwritten or self._sent_through)
 
     def write(self) -> None:
-        """Bring the store up to date; sqlite3.Error or StoreError where it cannot be written."""
+        """Write all changes to the store; sqlite3.Error or StoreError if it cannot be written."""
         if self.is_written:
             return
         with self._table.transaction():
@@ -152,7 +151,7 @@ class Outbox:
         self._sent_through = None
 
     def due_in_s(self) -> float | None:
-        """Seconds until the next delivery is to be tried; None where nothing waits."""
+        """Return the seconds until the next delivery attempt; None if nothing is pending."""
         if self._due_ns is None:
             return None
         now_ns = self._real.monotonic_ns()
@@ -165,24 +164,27 @@ class Outbox:
         return max(due_ns - now_ns, 0) / NS_PER_S
 
     def send(self) -> None:
-        """Deliver all that waits as one message; what fails is tried again later."""
+        """Deliver all pending notices as one message; a failed delivery is retried later."""
         notices = [entry.notice for entry in self._waiting]
         try:
             self.target.deliver(message_of(self._rig, notices, self._unlisted))
-        except Exception as error:  # a fault of one message or target must not end those of others
+        except Exception as error:  # an error of one message or target must not affect others
             self._failures += 1
             text = str(error) if isinstance(error, DeliveryError) else f"{type(error).__name__}: {error}"
             if text != self._error:
                 is_defect = not isinstance(error, DeliveryError)
                 log.warning(
-                    "notices are not delivered by %s, and tried again: %s", self.target.name, text, exc_info=is_defect
+                    "notices could not be delivered by %s and will be retried: %s",
+                    self.target.name,
+                    text,
+                    exc_info=is_defect,
                 )
             self._error = text
             self._due_ns = self._real.monotonic_ns() + round(self._retry_s * NS_PER_S)
             self._retry_s = min(2 * self._retry_s, self._pace.longest_retry_s)
             return
         now = self._clock.now()
-        log.info("%d notices are delivered by %s", len(notices) + self._unlisted, self.target.name)
+        log.info("%d notices were delivered by %s", len(notices) + self._unlisted, self.target.name)
         self._unwritten += [(entry.notice, now) for entry in self._waiting if entry.row is None]
         written = [entry.row for entry in self._waiting if entry.row is not None]
         if written:
@@ -195,7 +197,7 @@ class Outbox:
         self._sent += 1
 
     def status(self) -> dict[str, Any]:
-        """Return messages sent and failed since the start, notices that wait, and the last error."""
+        """Return counts of messages sent and failed since the start, of pending notices, and the last error."""
         return {
             "target": self.target.name,
             "waiting": len(self._waiting) + self._unlisted,

@@ -1,4 +1,4 @@
-"""The web server of the metrics: a caller who does not go on takes nothing that the daemon needs."""
+"""The web server of the metrics: a stalled client uses up nothing that the daemon needs."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from drivers.clock import TimeBudget
 if TYPE_CHECKING:
     from prometheus_client import CollectorRegistry
 
-IDLE_S = 5.0  # that a connection may say nothing, or take nothing
-LONGEST_S = 30.0  # from a connection to the end of its answer: a byte now and then keeps no place
-MOST_AT_ONCE = 16  # connections, each of which has a descriptor and a thread
-WAIT_S = 1.0  # for the end of one of them
-PAUSE_S = 0.2  # after a caller who could not be taken: what that lacks will be lacking a moment longer
+IDLE_S = 5.0  # longest time in which a connection neither sends nor receives
+LONGEST_S = 30.0  # longest time from a connection to the end of its answer, against clients that send single bytes
+MOST_AT_ONCE = 16  # connections, each with a descriptor and a thread
+WAIT_S = 1.0  # wait for the end of a connection when there are MOST_AT_ONCE
+PAUSE_S = 0.2  # after a connection could not be accepted: the missing resource will still be missing for a moment
 
 
 class _Handler(WSGIRequestHandler):
-    """Logs no request, and hangs up on a caller who does not go on."""
+    """Logs no requests, and disconnects a client that stalls."""
 
     timeout = IDLE_S
 
@@ -36,52 +36,52 @@ class _Handler(WSGIRequestHandler):
 
 
 class ScrapeServer(ThreadingMixIn, WSGIServer):
-    """Serves a registry, a bounded number of callers at once; what comes beyond waits a little and is hung up on.
+    """Serves a registry to a bounded number of clients at once; clients beyond it wait briefly and are disconnected.
 
     Args:
         host, port: to listen on.
-        registry: what is served.
+        registry: metrics to serve.
 
     Attributes:
-        trouble: why a caller was not taken since the registry was served last, a clause; None where all were.
+        trouble: why a client was refused since the last successful request, a clause; None if none was.
 
     Raises:
         OSError: the port cannot be opened.
     """
 
     daemon_threads = True
-    request_queue_size = MOST_AT_ONCE  # beyond it a caller's system waits a second before it asks again
+    request_queue_size = MOST_AT_ONCE  # a client beyond this backlog retries after a second
 
     def __init__(self, host: str, port: int, registry: CollectorRegistry) -> None:
         self.trouble: str | None = None
         self._places = threading.BoundedSemaphore(MOST_AT_ONCE)
-        self._turn = threading.Lock()  # of connections: one that is closed may be another's descriptor at once
+        self._turn = threading.Lock()  # guards connections: the descriptor of a closed connection may be reused at once
         self._open: dict[socket.socket, TimeBudget] = {}
         self._app = make_wsgi_app(registry)
         super().__init__((host, port), _Handler)
         self.set_app(self._serve)
 
     def get_request(self) -> tuple[socket.socket, Any]:
-        """Take a caller; one who cannot be taken goes on waiting, and nobody asks for him without a pause."""
+        """Accept a connection. On failure leave it pending and pause before the next attempt."""
         try:
             return super().get_request()
         except OSError as error:
-            if not isinstance(error, ConnectionError):  # which is a caller who has gone
-                self.trouble = f"a caller cannot be taken: {error.strerror}"
+            if not isinstance(error, ConnectionError):  # the client has disconnected
+                self.trouble = f"a connection cannot be accepted: {error.strerror}"
                 time.sleep(PAUSE_S)
             raise
 
     def process_request(self, request: Any, client_address: Any) -> None:
         if not self._places.acquire(timeout=WAIT_S):
-            self._turn_away(request, f"{MOST_AT_ONCE} callers, as many as are served at once, do not go on")
+            self._turn_away(request, f"all {MOST_AT_ONCE} connections are taken by stalled clients")
             return
         with self._turn:
             self._open[request] = TimeBudget(LONGEST_S)
         try:
             super().process_request(request, client_address)
-        except RuntimeError:  # the system has no thread to give
+        except RuntimeError:  # no thread can be started
             self._places.release()
-            self._turn_away(request, "the computer has no thread left for a caller")
+            self._turn_away(request, "the computer has no thread left for a connection")
 
     def process_request_thread(self, request: Any, client_address: Any) -> None:
         try:
@@ -95,15 +95,15 @@ class ScrapeServer(ThreadingMixIn, WSGIServer):
         super().shutdown_request(request)
 
     def service_actions(self) -> None:
-        """Hang up on callers whose time is over; called several times a second."""
+        """Disconnect clients that exceed `LONGEST_S`; called several times a second."""
         with self._turn:
             for request, left in self._open.items():
                 if left.is_over:
-                    with contextlib.suppress(OSError):  # the caller has gone
+                    with contextlib.suppress(OSError):  # the client has disconnected
                         request.shutdown(socket.SHUT_RDWR)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Say nothing of a caller who has gone, or does not go on."""
+        """Log no error about a client that has disconnected or stalls."""
         if not isinstance(sys.exc_info()[1], OSError):
             super().handle_error(request, client_address)
 

@@ -1,4 +1,4 @@
-"""The computer's clock, watched: read again and again, and the loss of its synchronisation noticed."""
+"""Monitors the computer's clock: reads its state periodically and detects the loss of its synchronisation."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ STOP_S = 5.0
 
 
 class TimeWatch:
-    """Reads the state of the computer's clock, in a thread of its own: an answer may take seconds.
+    """Reads the state of the computer's clock in its own thread, because an answer may take seconds.
 
-    A rig without a network is never synchronised, which is no news. That a clock no longer is, is.
+    Only a clock that was synchronised and no longer is counts as a loss: a rig without a network never is.
 
     Args:
         read: returns the state.
-        clock: time of the readings.
+        clock: for the times of the readings.
     """
 
     def __init__(self, read: Callable[[], ClockState], clock: Clock) -> None:
@@ -36,12 +36,12 @@ class TimeWatch:
         self._told = ""
 
     def start(self) -> None:
-        """Begin."""
+        """Start the thread."""
         self._thread = threading.Thread(target=self._run, name="clock", daemon=True)
         self._thread.start()
 
     def stop(self) -> None:
-        """End. Harmless when not started."""
+        """Stop the thread; harmless if it was not started."""
         self._stopping.set()
         if self._thread is not None:
             self._thread.join(STOP_S)
@@ -55,21 +55,21 @@ class TimeWatch:
         if state.error != self._told:
             self._told = state.error
             if state.error:
-                log.info("the state of the computer's clock is not known: %s", state.error)
+                log.info("the state of the computer's clock is unknown: %s", state.error)
 
     @property
     def state(self) -> ClockState | None:
-        """The newest state; None before the first."""
+        """The newest state; None before the first reading."""
         known = self._known
         return None if known is None else known[0]
 
     def lost(self) -> Stamp | None:
-        """Return when the clock was last synchronised, if it no longer is; None where it is, or never was."""
+        """Return when the clock was last synchronised if it no longer is; None if it is, or never was."""
         state = self.state
         return self._kept if state is not None and state.is_synchronized is False else None
 
     def status(self) -> dict[str, Any] | None:
-        """Return the newest state and its age, for people and programs; None before the first."""
+        """Return the newest state and its age, for `status`; None before the first reading."""
         known = self._known
         if known is None:
             return None

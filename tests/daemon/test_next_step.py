@@ -44,7 +44,7 @@ def guide(**step: Any) -> dict[str, Any]:
         (status(models={"live": LIVE, "candidate": None}), "Ready: model 4 is live", "Start a guided session"),
         (
             status(models={"live": LIVE, "candidate": None}, gap={"drift": {"alarm": "worse"}}),
-            "Model 4 is live, and check shots drift from it",
+            "Model 4 is live, but check shots show drift from it",
             "Start a guided session",
         ),
         (

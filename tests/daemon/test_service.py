@@ -188,7 +188,7 @@ def test_an_accepted_model_gives_the_live_tip_on_the_socket_and_on_the_bus(finis
     assert json.loads(run_apart("tip", *socket, "--json").stdout)["status"] == "no_model"
     refused = run_apart("model", "accept", str(early["id"]), *socket)
     assert refused.returncode == 3
-    assert "was not compared with held-out data yet" in refused.stderr
+    assert "was not compared on held-out data yet" in refused.stderr
     accepted = run_apart("model", "accept", str(best["id"]), "--operator", "Ada", *socket)
     assert accepted.returncode == 0, accepted.stderr
     # The screen may be full of alarms, where the computer has too much to do to feed the simulated buses.

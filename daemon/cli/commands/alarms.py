@@ -14,11 +14,11 @@ from daemon.cli.terminal import echo
 
 
 @click.command(cls=Command)
-@click.option("--all", "everything", is_flag=True, help="Also those that are over, newest first.")
-@click.option("--send-test", is_flag=True, help="Send a test notice the way that alarms go ([notify]).")
+@click.option("--all", "everything", is_flag=True, help="Also show cleared alarms, newest first.")
+@click.option("--send-test", is_flag=True, help="Send a test notice to all targets of notices ([notify]).")
 @client_options
 def alarms(everything: bool, send_test: bool, **where: Any) -> Any:
-    """Show what is wrong now, since when, and what to do about it."""
+    """Show the active alarms, their age and their remedies."""
     if send_test:
         return ask(where, "alarms.test-notice", echo)
     return ask(where, "alarms.list", _show, all=everything)

@@ -1,4 +1,4 @@
-"""`rigcal bench`: how well the program does on data of which the truth is known, and hidden from it."""
+"""`rigcal bench`: benchmarks on simulated data whose truth is hidden from the analysis."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from daemon.cli.command import DONE, FAILED, Command, Delivered, json_option, pr
 from daemon.cli.terminal import Coloured, echo, echo_list, echo_table
 
 if TYPE_CHECKING:
-    from daemon.benchmark.run import Run
+    from daemon.benchmark.run import BenchmarkResult
     from daemon.benchmark.score import Score, Tally
 
 _WORDS = ("right", "part", "wrong", "set", "unidentified", "none", "failed")
@@ -26,12 +26,14 @@ _SHOWN = 40
 
 @click.group()
 def bench() -> None:
-    """Benchmarks on simulated rigs."""
+    """Run benchmarks on simulated rigs."""
 
 
 @bench.command(cls=Command, name="gap")
-@click.option("--rig", default="swdt82", show_default=True, metavar="RIG", help="Shipped name, or path of a rig file.")
-@click.option("--short", is_flag=True, help="A few cases of every kind, for a first look: a minute or two.")
+@click.option(
+    "--rig", default="swdt82", show_default=True, metavar="RIG", help="Name of a shipped rig, or path of a rig file."
+)
+@click.option("--short", is_flag=True, help="Run only a few cases of every kind; takes a minute or two.")
 @click.option(
     "--cells",
     metavar="KIND,...",
@@ -40,28 +42,28 @@ def bench() -> None:
 )
 @click.option("--poses", metavar="KIND,...", help="Only these poses: wide, face, sparse, many, path.")
 @click.option("--noises", metavar="KIND,...", help="Only these encoders: fine, stepped (0.02 deg), coarse (0.1 deg).")
-@click.option("--effects", metavar="FAMILY,...", help="Only these families among the single effects.")
+@click.option("--effects", metavar="FAMILY,...", help="Only these families of single effects.")
 @click.option("--sizes", metavar="SIZE,...", help="Only these visible sizes, in units of the noise.")
-@click.option("--repeats", type=click.IntRange(min=1), metavar="N", help="Cases of every cell; 1 by default.")
+@click.option("--repeats", type=click.IntRange(min=1), metavar="N", help="Number of cases per cell; 1 by default.")
 @click.option(
     "--first",
     type=click.IntRange(min=0),
     metavar="SEED",
-    help="Seed of the first case, 1000000 by default. Below that are the seeds to tune on, from there on those to "
-    "report.",
+    help="Seed of the first case; 1000000 by default. Smaller seeds are for tuning, these and larger ones for "
+    "reporting.",
 )
 @click.option(
     "--workers",
     type=click.IntRange(min=1),
     default=lambda: os.cpu_count() or 1,
     metavar="N",
-    help="Processes that analyse; as many as there are cores by default.",
+    help="Number of worker processes; the number of cores by default.",
 )
 @click.option(
     "--keep",
     type=click.Path(path_type=Path, file_okay=False),
     metavar="DIR",
-    help="Keep observations, labels and answers there; thrown away by default.",
+    help="Directory in which to keep observations, labels and answers; deleted by default.",
 )
 @json_option
 def gap(
@@ -79,10 +81,11 @@ def gap(
     short: bool,
     as_json: bool,
 ) -> Delivered:
-    """Hide known effects in simulated observations and see which the gap workflow names.
+    """Score the gap workflow on simulated hidden effects.
 
-    The hidden effects are in a file that the analysis is not given; the same seed draws the same cases. Shares are
-    given with Wilson's 95 % intervals. The exit status is 1 where a bar is missed by more than chance.
+    Known effects are hidden in simulated observations, and the answers of the workflow are compared with them. The
+    hidden effects are in a file that the analysis does not get; the same seed draws the same cases. Shares have 95 %
+    Wilson intervals. The exit status is 1 if a target is missed by more than chance.
     """
     from daemon.benchmark.cases import NoSuchCasesError
     from daemon.benchmark.run import run
@@ -108,8 +111,8 @@ def gap(
     return Delivered(as_dict(found), DONE if is_good else FAILED)
 
 
-def as_dict(found: Run) -> dict[str, object]:
-    """JSON object of `rigcal bench gap`."""
+def as_dict(found: BenchmarkResult) -> dict[str, object]:
+    """Return the JSON object of `rigcal bench gap`."""
     return {
         "rig": found.rig,
         "cases": len(found.trials),
@@ -157,14 +160,14 @@ def _tally(tally: Tally) -> dict[str, Any]:
     }
 
 
-def _show(found: Run) -> None:
+def _show(found: BenchmarkResult) -> None:
     _show_scores(found.scores)
     if found.tallies:
         _show_families(found.tallies)
     echo_list("Cells that could not reach their size within the library's bounds", _counted(found.dropped), _SHOWN)
     missed = [t for t in found.trials if t.is_wrong or t.verdict == "failed"]
     echo_list(
-        "Named wrong, or ended in an error",
+        "Wrongly named, or ended in an error",
         [
             f"{t.kind} {t.poses} {t.noise} {t.size:g}x seed {t.seed}: "
             f"{' + '.join(f'{e.family}@{e.where}' for e in t.effects) or 'nothing'} answered as "
@@ -195,7 +198,7 @@ def _show_families(found: Sequence[Tally]) -> None:
     for tally in found:
         counts = [str(tally.outcomes[word] or "") for word in _WORDS]
         rows.append([tally.family, f"{tally.size:g}", *counts, ", ".join(_counted(Counter(tally.mistaken)))])
-    header = ("family", "size", *_WORDS, "taken for")
+    header = ("family", "size", *_WORDS, "mistaken for")
     echo_table(header, rows, title="Single effects", text_columns=(0, len(header) - 1))
 
 

@@ -1,4 +1,4 @@
-"""`rigcal calibrate`: observations in, a model and its report out."""
+"""`rigcal calibrate`: fits a model to observations and writes it with its report."""
 
 from __future__ import annotations
 
@@ -31,23 +31,29 @@ CONNECT_TIMEOUT_S = 5
 @offline.rig_option
 @offline.data_option
 @click.option(
-    "--out", type=offline.DIRECTORY, required=True, metavar="DIR", help="Where to write; replaces a model there."
+    "--out",
+    type=offline.DIRECTORY,
+    required=True,
+    metavar="DIR",
+    help="Directory of the new model; an existing model there is replaced.",
 )
-@click.option("--method", type=click.Choice(METHODS), default="default", show_default=True, help="How to identify.")
+@click.option(
+    "--method", type=click.Choice(METHODS), default="default", show_default=True, help="Method of identification."
+)
 @click.option(
     "--effects",
     default="auto",
     show_default=True,
     metavar="auto|none|FAMILY@WHERE,...",
-    help="Named physics to add to the kinematics: `auto` what the data ask for, found as `rigcal gap` does; `rigcal "
-    "effects` lists the families and where they may be.",
+    help="Effects to add to the kinematics: `auto` for those that the data show, found as by `rigcal gap`; `rigcal "
+    "effects` lists the families and their places.",
 )
 @click.option(
     "--residual",
     type=click.Choice(RESIDUALS),
     default="default",
     show_default=True,
-    help="Learner of what is left; `default` takes the one that helps on data it has not seen, or none.",
+    help="Learner of the residual error; `default` selects the one that is best on unseen data, or none.",
 )
 @offline.signal_option
 @offline.prior_option
@@ -57,7 +63,7 @@ CONNECT_TIMEOUT_S = 5
 @click.option(
     "--dask",
     metavar="ADDRESS",
-    help="Address of a dask scheduler whose workers share the work (needs the `dask` extra); the result is the same.",
+    help="Address of a dask scheduler whose workers do the work (requires the `dask` extra); the result is the same.",
 )
 @json_option
 def calibrate(
@@ -76,10 +82,10 @@ def calibrate(
     *,
     as_json: bool,
 ) -> dict[str, object]:
-    """Calibrate a rig from observations; write the model and its report to a directory.
+    """Calibrate a rig and write its model and report.
 
-    The figures are about the rows it was fitted to; `evaluate` gives those for rows it never saw. A global search keeps
-    its state beside DIR (DIR.checkpoint): the same command, killed and given again, goes on where it was.
+    The reported errors are for the rows that the model was fitted to; `rigcal evaluate` reports errors for other rows.
+    A global search stores its state in the file DIR.checkpoint: after an interruption, the same command resumes it.
     """
     watch = offline.Stopwatch()
     prepare()
@@ -118,7 +124,7 @@ def calibrate(
             ),
         )
         progress(1.0, "drawing the report and checking that the model loads")
-        with ThreadPoolExecutor(1) as pool:  # another process loads the model while this one draws
+        with ThreadPoolExecutor(1) as pool:  # a child process loads the model in the meantime
             loaded = pool.submit(model_files.check_loads, model, out)
             sources = {"data": offline.source_line(data, raw)}
             facts = facts_of(observations, model, name=out.name, made_utc_ns=watch.utc_ns, tolerance_mm=tolerance_mm)
@@ -137,7 +143,7 @@ def calibrate(
 
 
 def _check_effects(effects: str, method: str, rig: Rig) -> None:
-    """Refuse effects that are misspelt, that the rig has no place for, or that the method does not take."""
+    """Refuse effects that are misspelt, that have no place on the rig, or that the method does not support."""
     if effects in ("auto", "none"):
         return
     from calibration.effects.library import parse_effects
@@ -147,12 +153,12 @@ def _check_effects(effects: str, method: str, rig: Rig) -> None:
     except ValueError as error:
         raise click.BadParameter(str(error), param_hint="--effects") from error
     if method != "default":
-        raise click.BadParameter(f"--method {method} takes none", param_hint="--effects")
+        raise click.BadParameter(f"--method {method} does not support effects", param_hint="--effects")
 
 
 @contextlib.contextmanager
 def _cluster(address: str | None) -> Iterator[Executor | None]:
-    """The executor of a dask cluster; None without an address, for threads on this machine."""
+    """Yield the executor of a dask cluster; None without an address, for threads on this computer."""
     if address is None:
         yield None
         return

@@ -1,4 +1,4 @@
-"""`rigcal compare`: all methods on the same rows, or the first paper's experiments."""
+"""`rigcal compare`: all methods on the same rows, or the experiments of Zhou et al. 2022."""
 
 from __future__ import annotations
 
@@ -30,26 +30,26 @@ _MOST = 1000  # sentences: all of them
 @offline.rig_option
 @click.option("--data", type=offline.FILE, required=True, metavar="CSV", help="Observations to fit.")
 @click.option(
-    "--holdout", type=offline.FILE, required=True, metavar="CSV", help="Observations to judge by, never fitted."
+    "--holdout", type=offline.FILE, required=True, metavar="CSV", help="Held-out observations to judge the methods."
 )
 @click.option(
     "--protocol",
     type=click.Choice(PROTOCOLS),
-    help="Instead of all methods: the experiments of Zhou et al. 2022, section 4.",
+    help="Instead of all methods, run the experiments of Zhou et al. 2022, section 4.",
 )
 @click.option(
     "--out",
     type=click.Path(path_type=Path, file_okay=False),
     default=Path(),
     metavar="DIR",
-    help="Where the page with the plots goes, as comparison-RIG.html; the current directory by default.",
+    help="Directory for the page with plots, comparison-RIG.html; the current directory by default.",
 )
 @offline.signal_option
 @offline.prior_option
 @click.option(
     "--refit-base",
     is_flag=True,
-    help="Fit where the base stands in the station's frame, and nothing else, on the held-out rows first.",
+    help="First fit the position of the base in the station's frame, and nothing else, to the held-out rows.",
 )
 @offline.seed_option
 @offline.time_limit_option
@@ -70,18 +70,18 @@ def compare(
     refit_base: bool,
     as_json: bool,
 ) -> dict[str, object]:
-    """Compare all methods on held-out observations, in a table and on a page with plots.
+    """Compare all methods on held-out observations.
 
-    Rows have the names of `calibrate --method` and `--residual`. On the default method's kinematics and effects every
-    residual has a row of its own; `table` are stored corrections per cell of boom reach and direction, `rbfn-paper` is
-    a published network.
+    The result is a table, and a page with plots. Rows are named as in `calibrate --method` and `--residual`. Each
+    residual has a row, based on the default method's kinematics and effects; `table` is a table of corrections per cell
+    of boom reach and direction, `rbfn-paper` a published network.
 
-    A method that cannot use the data is listed with its reason. With --protocol zhou2022 the rig is calibrated from
-    single-joint, multi-joint and weighted data instead, with the Pareto front of the weights, a learning curve and the
-    error along the first 200 held-out points of the tip; the paper's own figures stand beside.
+    A method that cannot use the data is listed with the reason. With --protocol zhou2022 the rig is instead calibrated
+    from single-joint, multi-joint and weighted data. The result then has the Pareto front of the weights, a learning
+    curve and the error along the first 200 held-out points of the tip, with the figures of the paper for comparison.
     """
     if protocol is not None and refit_base:
-        raise click.UsageError(f"--protocol {protocol} judges at the set-ups of --data; leave --refit-base out")
+        raise click.UsageError(f"--protocol {protocol} uses the set-ups of --data; omit --refit-base")
     prepare()
     from calibration.experiments.comparison import compare as compare_methods
     from calibration.experiments.comparison import shared_rows
@@ -166,7 +166,7 @@ def show_comparison(comparison: Comparison) -> None:
 
 
 def show_protocol(protocol: Protocol) -> None:
-    """Print every table of the experiments, the paper's figures beside."""
+    """Print all tables of the experiments, with the paper's figures."""
     from daemon.report import zhou2022
 
     first = (0,)

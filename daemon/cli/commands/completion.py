@@ -1,4 +1,4 @@
-"""`rigcal completion`: the script by which a shell completes rigcal's commands and options."""
+"""`rigcal completion`: the script for completion of rigcal's commands and options in a shell."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from daemon.cli.command import Command
 from daemon.cli.terminal import echo_text
 
 PROGRAM = "rigcal"
-VARIABLE = "_RIGCAL_COMPLETE"  # click's name for it, made of the program's
+VARIABLE = "_RIGCAL_COMPLETE"  # click derives this name from the program's
 
 
 @click.command(cls=Command)
 @click.argument("shell", type=click.Choice(["bash", "zsh", "fish"]))
 @click.pass_context
 def completion(context: click.Context, shell: str) -> None:
-    """Print the script that makes a shell complete commands and options of rigcal.
+    """Print the script for completion in a shell.
 
-    The Debian package and deploy/install.sh put it in place for all users. For one user of bash:
-    `rigcal completion bash > ~/.local/share/bash-completion/completions/rigcal`.
+    With it the shell completes rigcal's commands and options. The Debian package and deploy/install.sh install it for
+    all users. For one user of bash: `rigcal completion bash > ~/.local/share/bash-completion/completions/rigcal`.
     """
     shell_class = get_completion_class(shell)
     assert shell_class is not None  # click has all three

@@ -14,16 +14,16 @@ from daemon.commands import INSTALLED_CONFIG
 
 @click.group()
 def config() -> None:
-    """The configuration file."""
+    """Check the configuration file."""
 
 
 @config.command("check", cls=Command)
 @click.argument("path", type=click.Path(path_type=Path), default=INSTALLED_CONFIG)
 @json_option
 def config_check(path: Path, *, as_json: bool) -> dict[str, Any]:
-    """Check a configuration, its rig, and the DBC and EDS files they name, without opening any device.
+    """Check a configuration without opening any device.
 
-    PATH is /etc/rigcal/rigcal.toml where none is given.
+    Also checks its rig, and the DBC and EDS files that they name. PATH is /etc/rigcal/rigcal.toml by default.
     """
     from daemon.composition import decoders
     from daemon.config.config import read_config
@@ -33,5 +33,5 @@ def config_check(path: Path, *, as_json: bool) -> dict[str, Any]:
     source = load_rig(settings.rig, named_in=path)
     links = decoders(settings, source)
     if not as_json:
-        echo(f"{path}: good: rig {source.rig.name}, links {', '.join(links) or 'none'}")
+        echo(f"{path}: valid: rig {source.rig.name}, links {', '.join(links) or 'none'}")
     return {"rig": source.rig.name, "links": list(links)}

@@ -1,4 +1,4 @@
-"""`rigcal demo`: a simulated boom, real CANopen and serial traffic, the daemon, and an operator's commands."""
+"""`rigcal demo`: a calibration with a simulated boom, real CANopen and serial traffic, daemon, and operator."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from daemon.cli.demo.operator import PRISMS, Advance, DemoError, Operator
 from daemon.cli.offline import show_stages
 from daemon.cli.terminal import echo
 
-EFFECTS = (  # hidden effects of the machine, beside its build tolerances
+EFFECTS = (  # hidden effects of the machine, in addition to its build errors
     "boom_droop@boom",
     "encoder_harmonic@theta1:k=2:cosk_rad=4e-3:sink_rad=3e-3",
     "encoder_harmonic@theta4:k=2:cosk_rad=3e-3:sink_rad=3e-3",
 )
 TRAINING_POSES = 22
 CHECK_POSES = 4
-JOB_STEPS = 60  # of progress, beside one for each pose
+JOB_STEPS = 60  # progress steps of the jobs, in addition to one for each pose
 _JOBS = {
-    "gap": "identification and missing physics",
-    "residual": "learning what remains",
+    "gap": "identification and missing effects",
+    "residual": "training of the residual model",
     "report": "the report",
     "comparison": "the comparison of models",
 }
@@ -40,21 +40,26 @@ _SEEDS = 100_000
     type=click.Path(file_okay=False, path_type=Path),
     default=Path("rigcal-demo"),
     show_default=True,
-    help="Directory for store, models and report; it must be new, empty, or of an earlier demo.",
+    help="Directory for store, models and report; it must be new, empty, or from an earlier demo.",
 )
-@click.option("--rate", type=click.FloatRange(1, 100), default=20.0, show_default=True, help="Simulated s per second.")
-@click.option("--seed", type=click.IntRange(0), help=f"Which simulated machine.  [default: {SEED}; any with --hidden]")
+@click.option(
+    "--rate", type=click.FloatRange(1, 100), default=20.0, show_default=True, help="Simulated seconds per second."
+)
+@click.option(
+    "--seed", type=click.IntRange(0), help=f"Seed of the simulated machine.  [default: {SEED}; random with --hidden]"
+)
 @click.option(
     "--hidden",
     "is_hidden",
     is_flag=True,
-    help="The simulated machine draws a hidden effect; the workflow looks for it, and then the truth is shown.",
+    help="Let the simulated machine draw a hidden effect, let the gap workflow search for it, then show the truth.",
 )
 @json_option
 def demo(out: Path, rate: float, seed: int | None, *, is_hidden: bool, as_json: bool) -> dict[str, Any]:
-    """Run a whole calibration without hardware: simulated boom, real protocols, sessions, jobs, report.
+    """Run a whole calibration without hardware.
 
-    With --hidden, a game: what physics does the simulated boom have that its model lacks?
+    It includes a simulated boom, real protocols, sessions, jobs and a report. With --hidden, the gap workflow searches
+    for an unknown effect of the simulated boom.
     """
     from daemon.cli.demo import hidden
 
@@ -104,7 +109,7 @@ def _wait_for_jobs(operator: Operator, advance: Advance) -> None:
         nonlocal told
         jobs = operator.say("jobs.list")
         share, text = awaited(jobs)
-        now = max(told, int(JOB_STEPS * share))  # sessions that were closed later queue jobs of their own
+        now = max(told, int(JOB_STEPS * share))  # sessions closed later queue further jobs
         advance(text, now - told)
         told = now
         reports = [job for job in jobs if job["kind"] == "report"]
@@ -114,10 +119,10 @@ def _wait_for_jobs(operator: Operator, advance: Advance) -> None:
 
 
 def awaited(jobs: Sequence[Mapping[str, Any]]) -> tuple[float, str]:
-    """Return the share of the jobs' work that is done, and what is awaited in words.
+    """Return the share of the jobs' work that is done, and a text on what is awaited.
 
     Args:
-        jobs: of the demonstration so far, oldest first, as `jobs.list` tells them.
+        jobs: of the demonstration so far, oldest first, as returned by `jobs.list`.
     """
     newest = {job["kind"]: job for job in jobs}
     shares = {kind: _share(newest.get(kind)) for kind in _JOBS}
@@ -140,11 +145,13 @@ def _steps() -> int:
 
 
 def _make_room(out: Path) -> None:
-    """Empty the directory of an earlier demo; UsageError for any other."""
+    """Empty the directory of an earlier demo; UsageError for any other directory that is not empty."""
     if out.exists() and any(out.iterdir()):
         config = out / "rigcal.toml"
         if not (config.is_file() and (out / "daemon.log").is_file()):
-            raise click.UsageError(f"{out} is not empty and holds no earlier demo; name another directory with --out")
+            raise click.UsageError(
+                f"{out} is neither empty nor from an earlier demo; name a different directory with --out"
+            )
         import shutil
 
         shutil.rmtree(out)

@@ -1,4 +1,4 @@
-"""`rigcal devices`: CANopen devices of the rig."""
+"""`rigcal devices`: the rig's CANopen devices."""
 
 from __future__ import annotations
 
@@ -13,15 +13,16 @@ from daemon.cli.terminal import echo
 
 @click.group()
 def devices() -> None:
-    """CANopen devices of the rig."""
+    """Set up CANopen devices of the rig."""
 
 
 @devices.command(cls=Command, name="configure")
-@click.option("--machine-is-parked", is_flag=True, help="The machine is parked and locked out.")
+@click.option("--machine-is-parked", is_flag=True, help="Confirm that the machine is parked and locked out.")
 @client_options
 def devices_configure(machine_is_parked: bool, **where: Any) -> Any:
-    """Check identity and resolution of the encoders, set their transmission, and start them.
+    """Check, configure and start the encoders.
 
-    Needs a link with allow_transmit = true that lists the nodes.
+    Identity and resolution are checked, and transmission is configured. Requires a link with allow_transmit = true and
+    the nodes in transmit_nodes.
     """
     return ask(where, "devices.configure", lambda result: echo(result["text"]), machine_is_parked=machine_is_parked)

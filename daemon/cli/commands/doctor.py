@@ -1,4 +1,4 @@
-"""`rigcal doctor`: looks for what keeps rigcal from working, and says what to type."""
+"""`rigcal doctor`: finds what prevents rigcal from working, and shows remedies."""
 
 from __future__ import annotations
 
@@ -24,11 +24,12 @@ _COLOURS = {"good": "green", "warning": "yellow", "fault": "red", "unknown": Non
 @click.command(cls=Command)
 @client_options
 def doctor(socket: Path | None, config: Path | None, as_json: bool) -> Delivered:
-    """Look at configuration, rights, interfaces, station, clock, disk, time-outs, daemon and store.
+    """Find what prevents rigcal from working.
 
-    Each finding says what to type. Nothing is sent to a bus or an instrument and nothing is changed: what only a
-    device can tell is known by a running daemon. Without --config, /etc/rigcal/rigcal.toml is read, where it is. The
-    exit status is 1 if something is at fault, 0 where there are at most warnings.
+    Checks configuration, permissions, interfaces, station, clock, disk, timeouts, daemon and store. Each finding has a
+    remedy. Nothing is sent to a bus or an instrument and nothing is changed; the state of devices is taken from a
+    running daemon. Without --config, /etc/rigcal/rigcal.toml is read if it exists. The exit status is 1 if there is a
+    fault, 0 if there are at most warnings.
     """
     logging.getLogger("can").setLevel(logging.ERROR)
     findings = list(_examine(socket, config))
@@ -54,19 +55,19 @@ def _examine(socket: Path | None, path: Path | None) -> Iterator[Finding]:
         if config is not None:
             yield from diagnosis.devices(config)
         elif path is None:
-            remedy = "`rigcal init` writes one; --config FILE names another"
-            yield Finding("configuration", "unknown", f"there is no {INSTALLED_CONFIG}", remedy)
+            remedy = "`rigcal init` writes one; use --config FILE for a different file"
+            yield Finding("configuration", "unknown", f"{INSTALLED_CONFIG} does not exist", remedy)
         yield diagnosis.socket_finding(str(error))
         return
     if config is not None:
-        # A simulated or replayed rig has the configuration of a real one, and none of its devices.
+        # A simulated or replayed rig has the configuration of a real rig but none of its devices.
         for finding in diagnosis.devices(config) if status["mode"] == "live" else ():
             yield _as_the_daemon_has_it(finding, status["acquisition"]["links"])
     yield from diagnosis.daemon_state(status, VERSION)
 
 
 def _as_the_daemon_has_it(finding: Finding, links: Sequence[dict[str, object]]) -> Finding:
-    """Return a finding on a port; that this user may not open it is no fault where the daemon has opened it."""
+    """Return a finding on a port; a fault becomes good if the daemon has the port open."""
     is_open = any(link["name"] == finding.subject and link["up"] for link in links)
     if finding.state == "fault" and is_open:
         return replace(finding, state="good", text=f"{finding.text}; the daemon has it open", remedy="")

@@ -20,7 +20,7 @@ _DEFAULT_RIG = "swdt82"
 _SESSION_S = 4 * 3600.0
 _PLACES_SHOWN = 4
 _NOTHING: Mapping[str, Any] = {"name": "", "unit": "", "sigma": None, "lower": None, "upper": None}
-_STEP_TIME = "time_s"  # a step may be anywhere in a session
+_STEP_TIME = "time_s"  # has no plausible size, as a step may be anywhere in a session
 
 
 @click.command(cls=Command)
@@ -30,21 +30,22 @@ _STEP_TIME = "time_s"  # a step may be anywhere in a session
     default=_DEFAULT_RIG,
     show_default=True,
     metavar="RIG",
-    help="Name of a shipped rig, or path of a rig file: places and plausible sizes are a rig's.",
+    help="Name of a shipped rig, or path of a rig file, for places and plausible sizes.",
 )
 @json_option
 def effects(name: str | None, rig: str, *, as_json: bool) -> dict[str, object]:
-    """List the library of effects, or show one of them, NAME, in full.
+    """List the library of effects, or describe effect NAME.
 
-    What each does, where it is from, its coefficients with unit, plausible size (1 sigma) and hard bounds, what data it
-    needs, what it is confused with, and what reveals it. Places and sizes are those of a rig.
+    Shows the equation of each effect, its source, its coefficients with unit, plausible size (1 sigma) and hard bounds,
+    the data that it needs, effects that it is confused with, and measurements that reveal it. Places and sizes depend
+    on the rig.
     """
     from calibration.effects.library import library
     from daemon.rig_files import load_rig
 
     found = load_rig(rig).rig
     if name is not None and name not in library():
-        raise click.BadParameter(f"{name!r} is unknown; there are {', '.join(library())}", param_hint="NAME")
+        raise click.BadParameter(f"{name!r} is unknown; known: {', '.join(library())}", param_hint="NAME")
     context = measured_everything(found)
     families = [described(library()[one], context) for one in ([name] if name else library())]
     result: dict[str, object] = {"rig": found.name, "effects": families}
@@ -57,7 +58,7 @@ def effects(name: str | None, rig: str, *, as_json: bool) -> dict[str, object]:
 
 
 def measured_everything(rig: Rig) -> EffectContext:
-    """Return the nominal rig in poses over its work volume, every prism and every optional column measured."""
+    """Return the nominal rig in poses over its work volume, with all prisms and all optional columns measured."""
     from dataclasses import replace
 
     import numpy as np
@@ -103,7 +104,7 @@ def described(family: Family, context: EffectContext) -> dict[str, Any]:
 def _coefficients(
     family: Family, context: EffectContext, where: str, settings: Mapping[str, float]
 ) -> list[dict[str, Any]]:
-    """Return the coefficients as outputs list them; without bounds where these follow from others."""
+    """Return the coefficients as in outputs; without bounds if these follow from other coefficients."""
     from calibration.effects.base import FittedCoefficient
 
     fitted = family.coefficients(context, where, settings)
@@ -125,8 +126,8 @@ def _show_all(rig: str, families: Sequence[Mapping[str, Any]]) -> None:
             rows.append([*cells, c["name"], _number(c["sigma"]), _number(c["upper"]), c["unit"]])
             cells = ["", ""]
     header = ("effect", "where", "coefficients", "plausible", "bound", "unit")
-    echo_table(header, rows, title=f"Effects that rigcal can name, and where in {rig}")
-    echo("Sizes are those of the first place. `rigcal effects NAME` tells all of one.")
+    echo_table(header, rows, title=f"Effects that rigcal can name, and their places in {rig}")
+    echo("Sizes are for the first place. `rigcal effects NAME` shows all about one effect.")
 
 
 def _show_one(rig: str, family: Mapping[str, Any]) -> None:
@@ -145,13 +146,13 @@ def _show_one(rig: str, family: Mapping[str, Any]) -> None:
             rows.append([where, c["name"], *(_number(c[key]) for key in ("sigma", "lower", "upper")), c["unit"]])
             where = ""
     header = ("where", "coefficient", "plausible", "lower bound", "upper bound", "unit")
-    echo_table(header, rows, title=f"Where in {rig}")
+    echo_table(header, rows, title=f"Places in {rig}")
     for needs, where in _needs(family["places"]).items():
         echo(f"  needs at {where}: {needs}")
 
 
 def _needs(places: Sequence[Mapping[str, Any]]) -> dict[str, str]:
-    """Return each need -> its places; a joint's name in a need is replaced by `<joint>`."""
+    """Return required data -> places; a joint's name in the requirement is replaced by `<joint>`."""
     found: dict[str, list[str]] = {}
     for place in places:
         if place["needs"]:
@@ -160,7 +161,7 @@ def _needs(places: Sequence[Mapping[str, Any]]) -> dict[str, str]:
 
 
 def _some(places: Sequence[str]) -> str:
-    """Return the places of a family; of many the first and the last."""
+    """Return the places of a family; if there are many, only the first and the last."""
     if len(places) > _PLACES_SHOWN:
         return f"{places[0]} .. {places[-1]} ({len(places)})"
     return " ".join(places) or "nowhere in this rig"

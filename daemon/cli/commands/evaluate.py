@@ -18,7 +18,7 @@ from daemon.cli.offline import (
 )
 from daemon.warm_up import prepare
 
-_FIXES_OF_A_BASE = 8  # of a set-up, below which a base of six parameters fits most of their errors
+_FIXES_OF_A_BASE = 8  # per set-up; with fewer, a refitted base of six parameters absorbs most of their errors
 
 
 @click.command(cls=Command)
@@ -27,14 +27,17 @@ _FIXES_OF_A_BASE = 8  # of a set-up, below which a base of six parameters fits m
 @click.option(
     "--refit-base",
     is_flag=True,
-    help="Fit where the base stands in the station's frame, and nothing else, on these rows first.",
+    help="First fit the position of the base in the station's frame, and nothing else, to these rows.",
 )
 @tolerance_option
 @json_option
 def evaluate(
     directory: Path, data: Path, tolerance_mm: float | None, *, refit_base: bool, as_json: bool
 ) -> dict[str, object]:
-    """Give the errors of a model, stage by stage, on observations that it was not fitted to."""
+    """Report the errors of a model on other observations.
+
+    The errors are given for each stage of the model, on observations that it was not fitted to.
+    """
     watch = Stopwatch()
     prepare()
     from calibration.evaluation.evaluation import evaluate as evaluate_model
@@ -53,5 +56,5 @@ def evaluate(
     is_base_free = refit_base and len(evaluation) < _FIXES_OF_A_BASE * len(evaluation.model.placements)
     is_held_out = not (evaluation.fitted or is_base_free)
     if is_base_free:
-        rows += ", too few beside the base that was fitted on them"
+        rows += ", too few as the base was fitted to them"
     return judged(result, tolerance_mm, rms_mm, rows, is_held_out=is_held_out, as_json=as_json)

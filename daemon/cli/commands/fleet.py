@@ -1,4 +1,4 @@
-"""`rigcal fleet`: many rigs, each calibrated, then held against each other."""
+"""`rigcal fleet`: calibrates many rigs and compares them."""
 
 from __future__ import annotations
 
@@ -24,11 +24,15 @@ CONNECT_TIMEOUT_S = 10.0
 @click.command(cls=Command)
 @click.argument("directories", nargs=-1, type=click.Path(exists=True, file_okay=False, path_type=Path))
 @click.option("--stores", metavar="GLOB", help="Stores of daemons, as a quoted pattern: 'rigs/*/rigcal.sqlite'.")
-@click.option("--rig", metavar="RIG", help="The rig of directories that have no rig.toml: a shipped name, or a path.")
+@click.option("--rig", metavar="RIG", help="Shipped rig, or path of a rig file, for directories without a rig.toml.")
 @click.option("--out", type=click.Path(file_okay=False, path_type=Path), required=True, help="Directory of the result.")
-@click.option("--gap/--no-gap", default=True, show_default=True, help="Look for effects that the models lack, or not.")
-@click.option("--workers", type=click.IntRange(1), help="Worker processes on this computer (needs the `dask` extra).")
-@click.option("--scheduler", metavar="ADDRESS", help="A dask scheduler whose workers share the work, instead.")
+@click.option("--gap/--no-gap", default=True, show_default=True, help="Search for effects that the models lack.")
+@click.option(
+    "--workers",
+    type=click.IntRange(1),
+    help="Number of worker processes on this computer (requires the `dask` extra); none by default.",
+)
+@click.option("--scheduler", metavar="ADDRESS", help="Address of a dask scheduler whose workers do the work.")
 @prior_option
 @seed_option
 @json_option
@@ -48,7 +52,7 @@ def fleet(
     """Calibrate every rig of a fleet and compare them.
 
     Each of DIRECTORIES is one rig: a daemon's state directory, or CSV files of observations with a rig.toml. The result
-    is fleet.html and fleet.parquet, and a file for each rig in rigs/: given again, the command goes on with the rigs
+    is fleet.html, fleet.parquet and a file for each rig in rigs/. If the command is repeated, it works only on rigs
     that are not done or whose data have changed. A rig that cannot be assessed is listed with the reason.
     """
     watch = Stopwatch()
@@ -74,7 +78,7 @@ def fleet(
     table = write_table(compared, out)
     made = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
     page = out / "fleet.html"
-    kept = [f"{table.name}: every rig and quantity", "rigs/: what was found of each rig, as JSON"]
+    kept = [f"{table.name}: all rigs and quantities", "rigs/: the result of each rig, as JSON"]
     write_file(page, fleet_report(compared, made, kept).encode())
     assessed = sum(len(group.answers) for group in compared.groups)
     outliers = [
@@ -89,7 +93,7 @@ def fleet(
         echo(f"{assessed} rigs assessed, {len(compared.failed)} not, in {watch.seconds:.0f} s")
         for failed in compared.failed[:10]:
             echo(f"  {failed['name']}: {failed['error']}", fg="red")
-        echo(f"in common: {', '.join(item['quantity'] for item in common[:10]) or 'nothing'}")
+        echo(f"common deviations: {', '.join(item['quantity'] for item in common[:10]) or 'none'}")
         echo(f"outliers: {', '.join(outliers[:10]) or 'none'}")
         echo(f"{page}, {table}")
     return {
@@ -105,7 +109,7 @@ def fleet(
 
 @contextlib.contextmanager
 def _engine(workers: int | None, scheduler: str | None) -> Iterator[Engine]:
-    """Yield where the work is done: this process, worker processes of its own, or a cluster."""
+    """Yield what carries out the work: this process, its own worker processes, or a cluster."""
     from daemon.fleet.run import Cluster, Here, local_workers
 
     try:

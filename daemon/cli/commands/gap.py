@@ -1,4 +1,4 @@
-"""`rigcal gap`: the physics that the simulation lacks, by name, and the model that has it."""
+"""`rigcal gap`: names the effects that the simulation lacks, and writes a model with them."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ if TYPE_CHECKING:
 @offline.rig_option
 @offline.data_option
 @click.option(
-    "--holdout", type=offline.FILE, metavar="CSV", help="Observations that nothing is fitted to, to judge by."
+    "--holdout", type=offline.FILE, metavar="CSV", help="Held-out observations to judge the result; none by default."
 )
 @click.option(
     "--out",
     type=offline.DIRECTORY,
     required=True,
     metavar="DIR",
-    help="Where model/, report.html and gap.json go, and plan.csv and plan.json where poses are asked for; "
-    "replaces an earlier answer.",
+    help="Directory for model/, report.html and gap.json, and for plan.csv and plan.json if poses are proposed; "
+    "an earlier answer there is replaced.",
 )
 @offline.signal_option
 @offline.prior_option
@@ -51,11 +51,12 @@ def gap(
     *,
     as_json: bool,
 ) -> dict[str, object]:
-    """Find where simulation and measurement disagree, name the missing physics, and add it.
+    """Find the effects that the simulation lacks.
 
-    The verdict is `named` (the effects are part of the model that is written), `none` (nothing beyond the noise),
-    `indistinguishable` (at most three effects that this data cannot tell apart, with poses that will) or `unidentified`
-    (structure that no effect of the library explains, with what it depends on). All four end with exit status 0.
+    Finds where simulation and measurement disagree, names the missing effects, and adds them to the model. The verdict
+    is `named` (the effects are part of the written model), `none` (nothing beyond the noise), `indistinguishable` (up
+    to three effects that these data cannot distinguish, with poses that can) or `unidentified` (structure that no
+    effect of the library explains, with the variables that it depends on). The exit status is 0 for each of them.
     `rigcal effects` lists the library.
     """
     watch = offline.Stopwatch()
@@ -114,7 +115,7 @@ def show_gap(found: GapResult) -> None:
     if found.effects:
         _show_effects(found)
     echo_list(
-        "One of these, which this data cannot tell apart",
+        "One of these, which these data cannot distinguish",
         [f"{place_name(c.family, c.where)}: {c.posterior:.0%}" for c in found.indistinguishable],
     )
     echo_list(
@@ -124,7 +125,7 @@ def show_gap(found: GapResult) -> None:
     if found.remaining_significant:
         echo(f"{remaining(found)} that was not named.")
     echo_list("What to measure next", [experiment.text for experiment in found.experiments])
-    echo_list("Not looked for", [f"{name.replace('_', ' ')}: {reason}" for name, reason in found.disabled.items()])
+    echo_list("Not searched for", [f"{name.replace('_', ' ')}: {reason}" for name, reason in found.disabled.items()])
     echo_list("Please note", found.warnings)
     if found.observations.ignored_columns:
         echo(f"Ignored columns: {', '.join(found.observations.ignored_columns)}")

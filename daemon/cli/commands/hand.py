@@ -1,4 +1,4 @@
-"""`rigcal hand`: the hands of a simulated rig that is moved as an operator would move it."""
+"""`rigcal hand`: moves a simulated rig in place of an operator's hands."""
 
 from __future__ import annotations
 
@@ -19,7 +19,10 @@ _FRESH_S, _AGAIN_S = 5.0, 0.2
 
 @click.group()
 def hand() -> None:
-    """Move a simulated rig by hand: for practice with `rigcal run --sim --by-hand`."""
+    """Move a simulated rig by hand.
+
+    For practice with a rig that was started with `rigcal run --sim --by-hand`.
+    """
 
 
 @hand.command(cls=Command)
@@ -34,14 +37,15 @@ def aim(target: str, **where: Any) -> Any:
 @click.argument("places", nargs=-1, metavar="[JOINT=VALUE]...")
 @client_options
 def move(places: tuple[str, ...], **where: Any) -> Any:
-    """Drive joints to values in deg or mm; without any, all joints to the pose that an open guide asks for.
+    """Drive joints to values in deg or mm.
 
-    Joints that are not named stay where they are. The command does not wait until the boom stands.
+    By default all joints are driven to the pose that an open guide asks for. Joints that are not named keep their
+    positions. The command does not wait until the boom stands still.
     """
     socket = socket_of(where["socket"], where["config"])
     wanted = _wanted(places)
     pose = _here(socket, wanted) if wanted else _guided(request(socket, "guide.state")["guide"])
-    return ask(where, "simulation.visit", lambda _: echo(f"the boom goes to {_told(pose)}"), poses=[pose])
+    return ask(where, "simulation.visit", lambda _: echo(f"the boom moves to {_told(pose)}"), poses=[pose])
 
 
 def _wanted(places: tuple[str, ...]) -> dict[str, float]:
@@ -59,24 +63,24 @@ def _wanted(places: tuple[str, ...]) -> dict[str, float]:
 
 
 def _here(socket: Path, wanted: Mapping[str, float]) -> dict[str, float]:
-    """Return the pose where the boom is, but for the joints that are wanted elsewhere."""
+    """Return the current pose of the boom, with the wanted values replaced."""
     from calibration.rig.description import parse_rig
 
     shown = request(socket, "rig.show")
     joints = parse_rig(shown["text"], shown["rig"]).joints
     names = [joint.name for joint in joints]
     if unknown := [name for name in wanted if name not in names]:
-        raise click.BadParameter(f"there is no joint {unknown[0]!r}; there are {', '.join(names)}", param_hint="JOINT")
+        raise click.BadParameter(f"there is no joint {unknown[0]!r}; known: {', '.join(names)}", param_hint="JOINT")
     read = _read(socket, [name for name in names if name not in wanted])
     pose = {}
     for joint in joints:
-        low, high = joint.limits  # a joint at its stop may read a little beyond
+        low, high = joint.limits  # a joint at its stop may read a little beyond its limit
         pose[joint.column] = wanted[joint.name] if joint.name in wanted else min(max(read[joint.name], low), high)
     return pose
 
 
 def _read(socket: Path, names: Sequence[str]) -> dict[str, float]:
-    """Return what these joints read; a computer that is busy may have no fresh reading for a moment."""
+    """Return the readings of joints; retry, as a busy computer may have no fresh reading for a moment."""
     read: dict[str, float] = {}
     until = time.monotonic() + _FRESH_S
     while True:
@@ -86,7 +90,7 @@ def _read(socket: Path, names: Sequence[str]) -> dict[str, float]:
         if not missing:
             return read
         if time.monotonic() > until:
-            raise click.ClickException(f"joint {missing[0]} is not read: give its value, too")
+            raise click.ClickException(f"joint {missing[0]} has no reading; also give its value")
         time.sleep(_AGAIN_S)
 
 

@@ -1,4 +1,4 @@
-"""`rigcal health`: one answer for a monitoring system, by its exit status.
+"""`rigcal health`: the rig's health as an exit status, for monitoring systems.
 
 The statuses are those of the Nagios plugin interface, which most monitoring systems understand: 0 good, 1 warning,
 2 critical, 3 unknown.
@@ -22,17 +22,17 @@ from daemon.host.safe_output import duration
 GOOD, WARNING, CRITICAL, UNKNOWN = 0, 1, 2, 3
 _WORDS = ("OK", "WARNING", "CRITICAL", "UNKNOWN")
 _STATUS = {"warning": WARNING, "critical": CRITICAL}
-HELD_UP_S = 30.0  # alarms are looked at once a second
+HELD_UP_S = 30.0  # alarms are normally evaluated once a second
 
 
 class _WrongUse(click.UsageError):
-    """Wrong use of a command whose status 2 means that the rig is in a critical state."""
+    """A usage error with exit status 3, because status 2 means that the rig is in a critical state."""
 
     exit_code = UNKNOWN
 
 
 class _Probe(Command):
-    """A command whose wrong use is `unknown`."""
+    """A command whose usage errors end with the status `unknown`."""
 
     def make_context(
         self, info_name: str | None, args: list[str], parent: click.Context | None = None, **extra: Any
@@ -46,9 +46,10 @@ class _Probe(Command):
 @click.command(cls=_Probe)
 @client_options
 def health(socket: Path | None, config: Path | None, as_json: bool) -> Delivered:
-    """Say whether all is well: exit status 0 good, 1 warning, 2 critical, 3 the daemon cannot be asked.
+    """Report the rig's health as exit status.
 
-    One line a finding, with what to do about it; for monitoring systems that run a command.
+    The status is 0 good, 1 warning, 2 critical, 3 if the daemon does not answer. Prints one line per finding, with its
+    remedy; for monitoring systems that run a command.
     """
     status, findings = _look(socket, config)
     if not as_json:
@@ -61,25 +62,25 @@ def health(socket: Path | None, config: Path | None, as_json: bool) -> Delivered
 
 
 def _look(socket: Path | None, config: Path | None) -> tuple[int, list[dict[str, Any]]]:
-    """Return the exit status, and what is wrong."""
+    """Return the exit status and the findings."""
     try:
         told = request(socket_of(socket, config), "status", timeout_s=STATUS_TIMEOUT_S)
     except CommandError as error:
-        return UNKNOWN, [_finding("unknown", "unreachable", "rigcal", str(error), "Look at `systemctl status rigcal`.")]
+        return UNKNOWN, [_finding("unknown", "unreachable", "rigcal", str(error), "Check `systemctl status rigcal`.")]
     findings = findings_of(told)
     return max((_STATUS[finding["severity"]] for finding in findings), default=GOOD), findings
 
 
 def findings_of(status: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Return what is wrong by a status of the daemon, the critical first."""
+    """Return the faults in a status of the daemon, the critical ones first."""
     alarms = status["alarms"]
     findings = [
         {key: alarm[key] for key in ("severity", "kind", "subject", "text", "remedy", "age_s")}
         for alarm in alarms["active"]
     ]
     if alarms["looked_age_s"] > HELD_UP_S:
-        text = f"the daemon is held up: alarms were last looked at {duration(alarms['looked_age_s'])} ago"
-        remedy = "Look at its log; `systemctl restart rigcal` if it stays so."
+        text = f"the daemon is blocked: alarms were last evaluated {duration(alarms['looked_age_s'])} ago"
+        remedy = "Check its log; if this persists, `systemctl restart rigcal`."
         findings.append(_finding("critical", "held_up", "rigcal", text, remedy))
     for part, why in status["unreadable"].items():
         text = f"{part} cannot be read from the store: {why}"

@@ -1,4 +1,4 @@
-"""`rigcal import`: an instrument's export as observations."""
+"""`rigcal import`: converts an instrument's export to observations."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from daemon.cli.terminal import echo
 
 @click.command(cls=Command, name="import")
 @click.argument("file", type=offline.FILE)
-@click.option("--out", type=click.Path(dir_okay=False, path_type=Path), required=True, help="The observations CSV.")
-@click.option("--map", "map_path", type=offline.FILE, help="Read the file by this map, which an import has written.")
-@click.option("--rig", metavar="RIG", help="Name of a shipped rig, or path of a rig file: its prisms and joints.")
+@click.option("--out", type=click.Path(dir_okay=False, path_type=Path), required=True, help="Observations file (CSV).")
+@click.option("--map", "map_path", type=offline.FILE, help="Read FILE with this map, which an earlier import wrote.")
+@click.option("--rig", metavar="RIG", help="Name of a shipped rig, or path of a rig file, for its prisms and joints.")
 @click.option(
     "--joints",
     type=offline.FILE,
-    help="CSV with a column for each joint (theta1_deg, ...) and pose (the point's number), time_s or time.",
+    help="CSV with a column for each joint (theta1_deg, ...) and a column pose (the point's number), time_s or time.",
 )
-@click.option("--prism", help="The prism that all points are of; otherwise by their codes or markers.")
-@click.option("--setup", default="", help="Name of the station set-up; of several in FILE, each has its own after it.")
-@click.option("--session", default="", help="Name of the session, for all rows.")
+@click.option("--prism", help="Prism of all points; by default taken from their codes or markers.")
+@click.option("--setup", default="", help="Name of the station set-up; if FILE has several, the prefix of their names.")
+@click.option("--session", default="", help="Session name for all rows; none by default.")
 @json_option
 def import_(
     file: Path,
@@ -38,11 +38,11 @@ def import_(
     *,
     as_json: bool,
 ) -> dict[str, Any]:
-    """Read FILE of a tracker or total station, and write observations.
+    """Convert an instrument's export to observations.
 
-    Formats: Topcon GTS memory downloads, Sokkia SDR33, Vicon trajectories, tables of Leica, FARO and others. What was
-    guessed of a table is said, and written beside the result as a map; with --map the same is done again. A bad file is
-    refused whole, with line, column and reason.
+    FILE is an export of a tracker or total station. Formats: Topcon GTS memory downloads, Sokkia SDR33, Vicon
+    trajectories, tables of Leica, FARO and others. Guesses about a table are shown and written to a map file next to
+    the result; --map applies them again. A file with an error is refused as a whole, with line, column and reason.
     """
     from calibration.observations import parse_observations
     from daemon.cli.imported_points import (
@@ -93,20 +93,20 @@ def import_(
     notes += bare_times(fixes, rows, file.name)
     table = observations_csv(fixes, prisms, file.name, rows, setups, session)
     if described is not None and rows is not None:
-        parse_observations(table.encode(), described, f"what {file.name} became")
+        parse_observations(table.encode(), described, f"observations of {file.name}")
     saved = None
     if map_path is None:
         saved = out.with_name(f"{out.stem}.map.toml")
         write_file(saved, map_text(columns, file.name).encode())
     write_file(out, table.encode())
     if not as_json:
-        echo(f"{known.title}: {len(fixes)} points, now rows of {out}")
+        echo(f"{known.title}: {len(fixes)} points written to {out}")
         for note in notes:
             echo(f"  {note}")
         if saved is not None:
-            echo(f"how it was read is in {saved}; --map {saved} does the same again")
+            echo(f"the map is in {saved}; --map {saved} reads files in the same way")
         if rows is None:
-            echo("no joint values: give them with --rig and --joints before you calibrate")
+            echo("the rows have no joint values; add them with --rig and --joints before you calibrate")
     return {
         "format": known.name,
         "points": len(fixes),

@@ -25,14 +25,14 @@ INTERFACES = ("socketcan", "slcan", "udp_multicast")
 
 
 class _Profiles(click.Choice[str]):
-    """A station profile's name; the profiles are looked for when it is given or its help is shown."""
+    """A station profile's name; the profiles are searched for only when needed, as their import is slow."""
 
     def __init__(self) -> None:
         self.case_sensitive = True
 
     @cached_property
-    def choices(self) -> tuple[str, ...]:  # type: ignore[override] # click sets it, and never again
-        """The names, that of the configuration's default first."""
+    def choices(self) -> tuple[str, ...]:  # type: ignore[override] # click sets it only once
+        """The names, the configuration's default first."""
         from drivers.stations.config import StationConfig
         from drivers.stations.profiles import station_profiles
 
@@ -49,49 +49,56 @@ PROFILE = _Profiles()
     type=click.Path(file_okay=False, path_type=Path),
     default=Path(),
     metavar="DIR",
-    help=f"Where to write {CONFIG} and {RIG}; here by default. A file that is there is never overwritten.",
+    help=f"Directory for {CONFIG} and {RIG}; the current one by default. Existing files are never overwritten.",
 )
-@click.option("--rig", metavar="NAME", help="A shipped rig; a rig file of one's own is written where none is named.")
+@click.option("--rig", metavar="NAME", help="Name of a shipped rig; by default a new rig file is written.")
 @click.option(
     "--joint",
     "joints",
     multiple=True,
     metavar="NAME:KIND:LOW:HIGH[:NODE]",
-    help="A joint of the rig file, from the base outwards: theta1:revolute:-15:60:32 (deg), L2:prismatic:0:2168 (mm).",
+    help="Joint of the rig file, from the base outwards: theta1:revolute:-15:60:32 (deg), L2:prismatic:0:2168 (mm). "
+    "May be repeated.",
 )
-@click.option("--prism", "prisms", multiple=True, metavar="NAME", help="A prism of the rig file; `r` by default.")
+@click.option(
+    "--prism", "prisms", multiple=True, metavar="NAME", help="Prism of the rig file; `r` by default. May be repeated."
+)
 @click.option("--interface", type=click.Choice(INTERFACES), default="socketcan", show_default=True, help="CAN adapter.")
-@click.option("--channel", metavar="NAME", help="CAN interface, port or group: can0, or /dev/ttyACM0 for slcan.")
-@click.option("--bitrate", type=click.IntRange(10_000, 1_000_000), help="Of the bus, for an slcan adapter.")
-@click.option("--station", "port", metavar="PORT", help="Serial port of the total station; `none` without one.")
-@click.option("--profile", type=PROFILE, help="What the station speaks; the first of them by default.")
-@click.option("--baud", type=click.IntRange(50, 4_000_000), help="Of the station; 9600 by default.")
+@click.option(
+    "--channel", metavar="NAME", help="CAN interface, port or group; by default can0, or /dev/ttyACM0 for slcan."
+)
+@click.option("--bitrate", type=click.IntRange(10_000, 1_000_000), help="Bit rate of the bus in bit/s, for slcan.")
+@click.option("--station", "port", metavar="PORT", help="Serial port of the total station; `none` for no station.")
+@click.option("--profile", type=PROFILE, help="Protocol of the station; the first in this list by default.")
+@click.option("--baud", type=click.IntRange(50, 4_000_000), help="Baud of the station; 9600 by default.")
 @click.option(
     "--listen",
     "listen_s",
     type=click.FloatRange(0, 600),
     default=0.0,
     metavar="SECONDS",
-    help="Listen so long to the bus, and to the station's port with each baud, for what is not given. Nothing is sent.",
+    help="Listen for this time to the bus, and to the station's port with each baud, to find settings that are not "
+    "given; not at all by default. Nothing is sent.",
 )
-@click.option("--no-questions", is_flag=True, help="Ask nothing; so it is too where standard input is no terminal.")
+@click.option("--no-questions", is_flag=True, help="Ask no questions, as when standard input is not a terminal.")
 @json_option
 def init(out: Path, rig: str | None, *, no_questions: bool, as_json: bool, **given: Any) -> dict[str, Any]:
-    """Write a commented configuration and rig file, by asking or by listening.
+    """Write a commented configuration and rig file.
 
-    What is heard on the bus (identifiers, CANopen nodes) and on serial ports (the baud under which records of a
-    station are sound) takes the place of questions. Listening never transmits; a station that answers only when it is
-    asked is not heard so. The files pass `rigcal config check`; what only the drawings know is marked FILL IN.
+    The contents come from answers to questions or from listening. Settings that are detected on the bus (identifiers,
+    CANopen nodes) and on serial ports (the baud that gives valid records of a station) are not asked for. Listening
+    never transmits, so a station that sends only on request is not detected. The files pass `rigcal config check`;
+    values that only the drawings have are marked FILL IN.
     """
     wanted = [out / CONFIG] if rig is not None else [out / CONFIG, out / RIG]
     for path in wanted:
         if path.exists():
-            raise CommandError(f"{path} is there already, and is not overwritten; name another directory with --out")
+            raise CommandError(f"{path} exists and is not overwritten; name a different directory with --out")
     if rig is not None:
         from calibration.rig.description import shipped_rigs
 
         if rig not in shipped_rigs():
-            raise CommandError(f"no rig {rig!r} ships with rigcal; there are {', '.join(shipped_rigs())}")
+            raise CommandError(f"there is no shipped rig {rig!r}; shipped: {', '.join(shipped_rigs())}")
     is_asking = not no_questions and not as_json and sys.stdin.isatty()
     answers = _answers(given, is_asking=is_asking)
     bus = _listen_to_bus(answers)
@@ -121,7 +128,7 @@ def init(out: Path, rig: str | None, *, no_questions: bool, as_json: bool, **giv
 
 
 def _answers(given: dict[str, Any], *, is_asking: bool) -> dict[str, Any]:
-    """Return the options with what is asked or usual for those that are not given."""
+    """Return the options; missing ones are asked for or set to their defaults."""
     answers = dict(given)
 
     def answer(key: str, question: str, usual: str) -> None:
@@ -131,9 +138,9 @@ def _answers(given: dict[str, Any], *, is_asking: bool) -> dict[str, Any]:
     usual_channel = "/dev/ttyACM0" if answers["interface"] == "slcan" else "can0"
     answer("channel", f"CAN interface ({answers['interface']})", usual_channel)
     _check_channel(answers)
-    answer("port", "Serial port of the total station (none without one)", _usual_port())
+    answer("port", "Serial port of the total station (none for no station)", _usual_port())
     if answers["port"] != "none" and not answers["listen_s"]:
-        answer("profile", f"What it speaks ({', '.join(PROFILE.choices)})", PROFILE.choices[0])
+        answer("profile", f"Its protocol ({', '.join(PROFILE.choices)})", PROFILE.choices[0])
         answer("baud", "Its baud", "9600")
     if is_asking and not answers["listen_s"] and click.confirm("Listen to bus and port for 5 s each?", err=True):
         answers["listen_s"] = 5.0
@@ -193,7 +200,7 @@ def _listen_to_station(answers: dict[str, Any]) -> HeardStation | None:
         echo_error(f"Warning: {error}", logging.WARNING)
         return None
     if heard is None:
-        echo_error("no record of a station was heard; one that answers only when it is asked is silent")
+        echo_error("no records of a station were received; a station that sends only on request cannot be detected")
     return heard
 
 
@@ -217,7 +224,9 @@ def _rig(answers: dict[str, Any], bus: HeardBus | None, *, is_asking: bool) -> s
 
     texts = list(answers["joints"])
     if not texts and is_asking:
-        echo_error("Joints from the base outwards, as theta1:revolute:-15:60:32 or L2:prismatic:0:2168:48; empty ends.")
+        echo_error(
+            "Joints from the base outwards, as theta1:revolute:-15:60:32 or L2:prismatic:0:2168:48; an empty line ends."
+        )
         while text := click.prompt("Joint", default="", show_default=False, err=True):
             texts.append(text)
     nodes = bus.nodes if bus is not None else ()
@@ -228,7 +237,7 @@ def _rig(answers: dict[str, Any], bus: HeardBus | None, *, is_asking: bool) -> s
 
 
 def _joint(text: str, place: int, nodes: tuple[int, ...]) -> JointChoice:
-    """Read NAME:KIND:LOW:HIGH[:NODE]; without a node the joint gets the next one that was heard, or a free one."""
+    """Parse NAME:KIND:LOW:HIGH[:NODE]; the default node is the next one that was detected, or a free number."""
     from daemon.cli.starter_files import JointChoice
 
     parts = text.split(":")
@@ -246,10 +255,10 @@ def _joint(text: str, place: int, nodes: tuple[int, ...]) -> JointChoice:
 
 
 def _check(path: Path) -> None:
-    """Read the files as the daemon would.
+    """Read the files as the daemon does.
 
     Raises:
-        CommandError: an answer makes no sense; the files stay, to be mended.
+        CommandError: an answer is invalid; the files are kept, to be corrected.
     """
     from calibration.errors import RigError
     from daemon.composition import decoders
@@ -260,7 +269,7 @@ def _check(path: Path) -> None:
         settings = read_config(path)
         decoders(settings, load_rig(settings.rig, named_in=path))
     except RigError as error:
-        raise CommandError(f"the files are written, and do not pass `rigcal config check {path}`: {error}") from error
+        raise CommandError(f"the files are written but do not pass `rigcal config check {path}`: {error}") from error
 
 
 def _tell(out: Path, files: dict[str, str]) -> None:
@@ -268,5 +277,5 @@ def _tell(out: Path, files: dict[str, str]) -> None:
         echo(f"wrote {out / name}")
     marked = sum(text.count("FILL IN") for text in files.values())
     if marked:
-        echo(f"fill in what the drawings say, at the {marked} places marked FILL IN")
-    echo(f"then `rigcal config check {out / CONFIG}`, and `rigcal doctor --config {out / CONFIG}`")
+        echo(f"fill in the values from the drawings at the {marked} places marked FILL IN")
+    echo(f"then run `rigcal config check {out / CONFIG}` and `rigcal doctor --config {out / CONFIG}`")

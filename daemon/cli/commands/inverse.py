@@ -1,4 +1,4 @@
-"""`rigcal inverse`: the joint values to command so that the true prism is where it should be."""
+"""`rigcal inverse`: joint values to command so that the true prisms reach their targets."""
 
 from __future__ import annotations
 
@@ -18,20 +18,21 @@ from daemon.warm_up import prepare
 @offline.csv_out_option
 @json_option
 def inverse(directory: Path, data: Path, out: Path | None, *, as_json: bool) -> dict[str, object] | Delivered:
-    """Compute the joint values to command, so that the true prisms are where x_mm, y_mm, z_mm of the data say.
+    """Compute the joint values that bring prisms to targets.
 
-    These are places in the frame of the set-up's station as it would measure them, the inverse of `rigcal predict`:
-    where the model knows that the station's scale or a prism's constant is wrong, a fix there reads the target.
+    With these joint values the true prisms reach x_mm, y_mm, z_mm of the data. Targets are in the frame of the set-up's
+    station as it would measure them, so this is the inverse of `rigcal predict`: if the model knows that the station's
+    scale or a prism constant is wrong, a fix there reads the target.
 
-    The joints in the data are the nominal command: of all joint values that reach the targets, those nearest to it are
-    found, inside the limits of the joints. Rows of one pose are solved together: two prisms of a feed give its
-    attitude. The whole model counts, effects and learned residual too; columns that these need (direction of approach,
-    payload, temperature) are taken from the rows.
+    The joints in the data are the nominal command: of all joint values within the limits that reach the targets, the
+    nearest to it are found. Rows of one pose are solved together, so that two prisms of a feed determine its attitude.
+    The whole model is used, including effects and learned residual; the columns that these need (direction of
+    approach, payload, temperature) are taken from the rows.
 
-    The result is the data's own columns with the joints replaced, and closure_mm: how far the model then has each prism
-    from its target. With --json it goes to the file of --out, or else into the object as "csv".
+    The result is the data with the joints replaced and a column closure_mm, the distance of each prism from its target
+    according to the model. With --json it is written to the file of --out, or else is in the object as "csv".
 
-    A target that cannot be reached to 0.01 mm is named; the joints given for it bring the prism as near as can be, and
+    A target that cannot be reached within 0.01 mm is reported; its joints then bring the prism as near as possible, and
     the exit status is 3.
     """
     watch = offline.Stopwatch()

@@ -14,15 +14,18 @@ from daemon.cli.terminal import echo
 
 @click.group()
 def jobs() -> None:
-    """Background jobs: gap workflow, residual training, reports, comparisons, drift of checks."""
+    """List, cancel and retry background jobs.
+
+    Jobs are the gap workflow, residual training, reports, comparisons and drift checks.
+    """
 
 
 @jobs.command(cls=Command, name="list")
 @client_options
 def jobs_list(**where: Any) -> Any:
-    """List all jobs: session, how long each took, its result or why it failed, and its report.
+    """List all jobs with session, duration, result or error, and report.
 
-    Sessions that have started no job are listed with the reason.
+    Sessions without a job are listed with the reason.
     """
     silent = where | {"as_json": True}
     found = ask(silent, "jobs.list", echo)
@@ -30,7 +33,7 @@ def jobs_list(**where: Any) -> Any:
     if not where["as_json"]:
         show_jobs(found["result"], without)
         if not found["result"] and not without:
-            echo("no jobs yet: `rigcal session start` opens a session, and its jobs are queued after it is closed")
+            echo("no jobs yet: jobs are queued after a session is closed; `rigcal session start` opens a session")
     return found | {"without_job": [{key: session[key] for key in ("id", "no_job")} for session in without]}
 
 
@@ -38,7 +41,7 @@ def jobs_list(**where: Any) -> Any:
 @click.argument("number", type=int)
 @client_options
 def jobs_cancel(number: int, **where: Any) -> Any:
-    """Cancel a queued or running job and those that wait for it."""
+    """Cancel a queued or running job and the jobs that depend on it."""
     return ask(where, "jobs.cancel", echo, id=number)
 
 
@@ -46,5 +49,5 @@ def jobs_cancel(number: int, **where: Any) -> Any:
 @click.argument("number", type=int)
 @client_options
 def jobs_retry(number: int, **where: Any) -> Any:
-    """Queue a job again that did not end well."""
+    """Queue a failed, cancelled or interrupted job again."""
     return ask(where, "jobs.retry", echo, id=number)

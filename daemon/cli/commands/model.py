@@ -1,4 +1,4 @@
-"""`rigcal model`: the live model, its candidates, and a model for other programs."""
+"""`rigcal model`: the live model, candidates, and export for other programs."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ _GRIDS = ("grid", "parquet")
 
 @click.group()
 def model() -> None:
-    """Models of the rig: candidates, the live one, and those that it replaced."""
+    """List, compare, accept, roll back and export models."""
 
 
 @model.command(cls=Command, name="list")
 @client_options
 def model_list(**where: Any) -> Any:
-    """List all models, with how they compared with the live one on check sessions."""
+    """List all models with their comparisons."""
     return ask(where, "model.list", _show_list)
 
 
@@ -39,7 +39,10 @@ def model_list(**where: Any) -> Any:
 @click.argument("number", type=int, required=False)
 @client_options
 def model_show(number: int | None, **where: Any) -> Any:
-    """Show model NUMBER (the live one by default): its directory, effects and comparison, who put it live and when."""
+    """Show a model, by default the live one.
+
+    Shows its directory, effects, comparison with the live model, and history.
+    """
     return ask(where, "model.show", _show, id=number)
 
 
@@ -47,9 +50,10 @@ def model_show(number: int | None, **where: Any) -> Any:
 @click.argument("number", type=int)
 @client_options
 def model_compare(number: int, **where: Any) -> Any:
-    """Compare model NUMBER with the one that is live now, on the check sessions that neither was trained on.
+    """Compare model NUMBER with the live model.
 
-    This happens by itself after each training and each check session, for the newest model.
+    The comparison uses the check sessions that neither was trained on. For the newest model this happens automatically
+    after each training and each check session.
     """
     return ask(where, "model.compare", echo, id=number)
 
@@ -61,21 +65,24 @@ def model_compare(number: int, **where: Any) -> Any:
 def model_accept(number: int, operator: str, **where: Any) -> Any:
     """Make candidate NUMBER the live model.
 
-    It must have been compared on check sessions that it was not trained on, and must have shown there a smaller error
-    than the live model, by more than chance; the first model that goes live must show no larger error than its own
-    nominal stage (the drawings). Else it is refused (exit status 3), as are damaged files and a model of another rig
-    file. `rigcal model list` shows how each compared.
+    Its error on check sessions that it was not trained on must be significantly smaller than that of the live model.
+    For the first model that goes live, the error must not be larger than that of its own nominal stage (the drawings).
+    Otherwise it is refused (exit status 3), as are damaged files and a model of a different rig file. `rigcal model
+    list` shows the comparisons.
     """
     return ask(where, "model.accept", _changed, id=number, operator=operator)
 
 
 @model.command(cls=Command, name="reject")
 @click.argument("number", type=int)
-@click.option("--reason", required=True, help="Why; kept with the model.")
+@click.option("--reason", required=True, help="Reason, stored with the model.")
 @operator_option
 @client_options
 def model_reject(number: int, reason: str, operator: str, **where: Any) -> Any:
-    """Retire candidate NUMBER for good, so that nobody accepts it by mistake. It never goes live."""
+    """Retire candidate NUMBER permanently.
+
+    Then nobody can accept it by mistake.
+    """
     return ask(where, "model.reject", echo, id=number, reason=reason, operator=operator)
 
 
@@ -84,7 +91,10 @@ def model_reject(number: int, reason: str, operator: str, **where: Any) -> Any:
 @operator_option
 @client_options
 def model_rollback(number: int | None, operator: str, **where: Any) -> Any:
-    """Put back the model that the live one replaced, or model NUMBER, which was live once."""
+    """Make an earlier live model live again.
+
+    By default this is the predecessor of the live model; NUMBER may be any model that was live before.
+    """
     return ask(where, "model.rollback", _changed, id=number, operator=operator)
 
 
@@ -92,15 +102,16 @@ def model_rollback(number: int | None, operator: str, **where: Any) -> Any:
 @operator_option
 @client_options
 def model_zeros_checked(operator: str, **where: Any) -> Any:
-    """Use the model again after a joint's encoder has jumped, its zero being checked or set back.
+    """Confirm the joints' zeros after an encoder has jumped.
 
-    The model is the live one, or the newest candidate where none is live; sessions with its zeros are used again, too.
+    The model is then used again. First check that the zero is unchanged, or set it back. The model is the live one, or
+    the newest candidate if none is live; sessions with the same zeros are used again, too.
     """
     return ask(where, "model.zeros-checked", echo, operator=operator)
 
 
 class _ExportCommand(Command):
-    """A command whose help lists the export formats, which are found in their folder."""
+    """A command whose help lists the export formats."""
 
     def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:  # noqa: ARG002 - click's
         with formatter.section("Formats"):
@@ -119,23 +130,23 @@ def _completed(_ctx: click.Context, _parameter: click.Parameter, incomplete: str
 
 @model.command(cls=_ExportCommand, name="export")
 @click.argument("number", type=int, required=False)
-@click.option("--model", "directory", type=click.Path(path_type=Path), metavar="DIR", help="A model's directory.")
-@click.option("--out", type=click.Path(file_okay=False, path_type=Path), required=True, help="Where to write.")
+@click.option("--model", "directory", type=click.Path(path_type=Path), metavar="DIR", help="Directory of a model.")
+@click.option("--out", type=click.Path(file_okay=False, path_type=Path), required=True, help="Directory of the result.")
 @click.option(
     "--format",
     "names",
     multiple=True,
     shell_complete=_completed,
     metavar="FORMAT",
-    help="What to write: json and grid when not given. May be given again.",
+    help="Format to write; json and grid by default. May be repeated.",
 )
-@click.option("--prism", "prisms", multiple=True, help="Prisms of the grid; all when not given. May be repeated.")
+@click.option("--prism", "prisms", multiple=True, help="Prism of the grid; all by default. May be repeated.")
 @click.option(
     "--rows",
     type=click.IntRange(64, 1_000_000),
     default=20_000,
     show_default=True,
-    help="Greatest number of poses in the grid; more of them are interpolated more closely.",
+    help="Largest number of poses in the grid; more poses are interpolated more accurately.",
 )
 @client_options
 def model_export(
@@ -150,12 +161,13 @@ def model_export(
     *,
     as_json: bool,
 ) -> Any:
-    """Write a model for other programs, and say what each form leaves out and what that costs.
+    """Write a model for other programs.
 
-    With --model no daemon is needed; else model NUMBER of the running daemon is taken, the live one by default.
+    The output states what each format omits and the error that this causes. With --model no daemon is needed; otherwise
+    model NUMBER of the running daemon is exported, the live one by default.
 
-    docs/how-to/export.md says how to use each. The error of what is left out is measured over the joint values of
-    the training.
+    docs/how-to/export.md describes how to use each format. The error is measured over the joint values of the training
+    data.
     """
     if directory is not None and number is not None:
         raise click.UsageError("give either a model's NUMBER or --model DIR")
@@ -202,7 +214,7 @@ def _show_list(models: Sequence[Mapping[str, Any]]) -> None:
         compared = model["comparison"]
         verdict = compared["sentence"] if compared else "not compared yet"
         if compared and compared["is_stale"]:
-            then = "when none was live" if compared["live"] is None else f"with model {compared['live']}, live then"
+            then = "when none was live" if compared["live"] is None else f"with model {compared['live']}, then live"
             verdict = f"out of date, compared {then}: {verdict}"
         made = utc(model["created_utc_ns"])
         rows.append([str(model["id"]), model["state"], model["stage"], made, str(model["sessions"]), verdict])
@@ -214,7 +226,7 @@ def _show(model: Mapping[str, Any]) -> None:
     echo(f"  trained on {', '.join(model['sessions'])}; manifest SHA-256 {model['manifest_sha256']}")
     effects = model["metrics"].get("effects", ())
     if not effects:
-        echo("  no effect is named in it")
+        echo("  it has no named effects")
     for effect in effects:
         sizes = (
             f"{name} {c['value']:.4g} {PLUS_MINUS} {INTERVAL_SIGMAS * c['standard_error']:.2g} {c['unit']} (95 %)"
@@ -224,13 +236,13 @@ def _show(model: Mapping[str, Any]) -> None:
         echo(f"  effect {effect['family']}@{effect['where']}{form}: {', '.join(sizes)}")
     compared = model["metrics"].get("comparison")
     if compared is not None:
-        other = "no live model" if compared["live"] is None else f"model {compared['live']}, live then"
-        echo(f"  beside {other}, check sessions {', '.join(compared['sessions']) or 'none'}:")
+        other = "no live model" if compared["live"] is None else f"model {compared['live']}, then live"
+        echo(f"  compared with {other}, check sessions {', '.join(compared['sessions']) or 'none'}:")
         echo(f"  {compared['sentence']}")
         for setup in compared.get("refitted", ()):
-            echo(f"  the base at set-up {setup} was fitted on these very fixes, for both alike")
+            echo(f"  the base at set-up {setup} was fitted to these same fixes, for both models")
         for setup in compared.get("left_out", ()):
-            echo(f"  set-up {setup} is unknown and its fixes place no base: left out")
+            echo(f"  set-up {setup} was skipped: it is unknown and its fixes do not determine a base")
     for change in model["history"]:
         by = f" by {name}" if (name := who(change["operator"], change["user"])) else ""
         echo(f"  {utc(change['utc_ns'])} {change['state']}{by}: {change['reason']}")

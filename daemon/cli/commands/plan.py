@@ -1,4 +1,4 @@
-"""`rigcal plan`: the poses to measure."""
+"""`rigcal plan`: plans the poses to measure."""
 
 from __future__ import annotations
 
@@ -32,32 +32,32 @@ _LIST_SEPARATOR = " "
     "directory",
     type=click.Path(path_type=Path),
     metavar="DIR",
-    help="A model of the rig: plan what else to measure, at its set-up.",
+    help="Directory of a model of the rig: plan additional poses, at one of its set-ups.",
 )
 @click.option(
     "--separate",
     metavar="FAMILY@WHERE,FAMILY@WHERE[,...]",
-    help="Tell these effects apart, two or three, e.g. joint_compliance@theta4,encoder_harmonic@theta4.",
+    help="Distinguish these two or three effects, e.g. joint_compliance@theta4,encoder_harmonic@theta4.",
 )
-@click.option("--poses", type=click.IntRange(1, _MOST_POSES), required=True, metavar="N", help="How many poses.")
+@click.option("--poses", type=click.IntRange(1, _MOST_POSES), required=True, metavar="N", help="Number of poses.")
 @click.option(
     "--station",
     metavar="X,Y,Z",
-    help="Where the total station stands, mm in the rig's base frame; a new set-up. By default the model's place, or "
-    "without a model one about the base from where most is seen.",
+    help="Position of the total station for a new set-up, mm in the rig's base frame. By default its position in the "
+    "model, or without a model a position near the base with the best view.",
 )
 @click.option(
-    "--setup", metavar="NAME", help="Which of the model's set-ups; by default the one whose base is known best."
+    "--setup", metavar="NAME", help="Set-up of the model; by default the one whose base is known most accurately."
 )
 @click.option(
     "--floor",
     "floor_mm",
     type=FiniteNumber(),
     metavar="MM",
-    help="Height of the floor over the base's origin; by default 15 % of the reach below it.",
+    help="Height of the floor above the base's origin; by default 15 % of the reach below it.",
 )
 @click.option(
-    "--out", type=click.Path(path_type=Path, dir_okay=False), metavar="CSV", help="Also write the poses to a file."
+    "--out", type=click.Path(path_type=Path, dir_okay=False), metavar="CSV", help="Also write the poses to this file."
 )
 @seed_option
 @json_option
@@ -76,10 +76,10 @@ def plan(
 ) -> dict[str, object]:
     """Plan the poses of a calibration session.
 
-    They are inside the joint limits, in view of the station, ordered for short motion, and chosen so that the rig's
-    parameters come out best determined; with --model so that the model's expected error over the work volume falls
-    most; with --separate so that two or three effects can be told apart. Where these need it, a pose also says from
-    which side to come, how long to stand, what to carry, whether to measure on the move, or when.
+    Poses are within the joint limits, visible from the station, and ordered for short motion. They are chosen so that
+    the rig's parameters are determined as well as possible; with --model so that the expected error over the work
+    volume decreases most; with --separate so that two or three effects can be distinguished. If effects need it, a pose
+    also has the direction of approach, the dwell time, the payload, the time, or whether to measure on the move.
     """
     prepare()
 
@@ -93,7 +93,7 @@ def plan(
     effects = _effects(separate, source.rig)
     place = _station(station)
     if setup is not None and (directory is None or station is not None):
-        raise click.BadParameter("it is one of a model's: give --model, and no --station", param_hint="--setup")
+        raise click.BadParameter("names a set-up of a model; give --model, and omit --station", param_hint="--setup")
     model = None if directory is None else read_model(directory)
     with progress_display(as_json=as_json) as progress:
         planned = plan_poses(
@@ -140,7 +140,9 @@ def _station(text: str | None) -> Floats | None:
     except ValueError:
         place = np.empty(0)
     if place.shape != (3,) or not np.isfinite(place).all():
-        raise click.BadParameter(f"{text!r} is no place; give X,Y,Z in mm, e.g. 0,-6000,1600", param_hint="--station")
+        raise click.BadParameter(
+            f"{text!r} is not a position; give X,Y,Z in mm, e.g. 0,-6000,1600", param_hint="--station"
+        )
     return place
 
 
@@ -169,7 +171,7 @@ def _show(planned: PosePlan, result: Mapping[str, Any]) -> None:
     for effect, sigma in result["stands_out_sigma"].items():
         echo(f"{effect} of plausible size stands out from the others by {sigma:.1f} sigma")
     for title, sentences in (
-        ("What else", result["advice"]),
+        ("Further advice", result["advice"]),
         ("Please note", result["warnings"]),
         ("Assumed", result["assumptions"]),
     ):

@@ -1,4 +1,4 @@
-"""`rigcal predict`: positions from joint readings."""
+"""`rigcal predict`: predicts positions from joint readings."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ INTERVAL_COLUMNS = names(INTERVALS)
 @click.option(
     "--intervals",
     is_flag=True,
-    help="Add half90_x_pred_mm, half90_y_pred_mm, half90_z_pred_mm (a fix is that near to x, y, z with 90 % "
-    "probability, each) and radius90_pred_mm (all three together).",
+    help="Add half90_x_pred_mm, half90_y_pred_mm, half90_z_pred_mm (half widths of 90 % intervals of a fix in x, y, z) "
+    "and radius90_pred_mm (radius that contains a fix with 90 % probability).",
 )
 @json_option
 def predict(directory: Path, data: Path, out: Path | None, *, intervals: bool, as_json: bool) -> dict[str, object]:
-    """Predict positions and their standard deviations from joint readings; the data need no positions.
+    """Predict positions from joint readings.
 
-    The result is the data's own columns and the predicted ones. With --json it goes to the file of --out, or else into
-    the object as "csv".
+    Standard deviations are predicted, too. The data need no positions. The result is the data with the predicted
+    columns added. With --json it is written to the file of --out, or else is in the object as "csv".
     """
     watch = offline.Stopwatch()
     prepare()
@@ -65,7 +65,7 @@ def predict(directory: Path, data: Path, out: Path | None, *, intervals: bool, a
 
 
 def _predicted_columns(prediction: Prediction, *, intervals: bool) -> dict[str, Floats]:
-    """Return the columns that predictions add to an observations CSV, with their intervals if they are wanted."""
+    """Return the columns that predictions add to an observations CSV, with intervals if requested."""
     columns = {name: prediction.position_mm[:, i] for i, name in enumerate(PREDICTED_COLUMNS[:3])}
     columns |= {name: prediction.sigma_mm[:, i] for i, name in enumerate(PREDICTED_COLUMNS[3:])}
     if intervals:

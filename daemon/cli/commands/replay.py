@@ -1,4 +1,4 @@
-"""`rigcal replay`: captured logs into a store of their own."""
+"""`rigcal replay`: replays captured logs into a new store."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ COUNTED = ("joint_samples", "signals", "fixes", "device_events", "decode_failure
     "--config",
     type=click.Path(path_type=Path),
     required=True,
-    help="Configuration whose rig and links the logs are of.",
+    help="Configuration with the rig and links of the logs.",
 )
 @click.option(
     "--store",
     "path",
     type=click.Path(path_type=Path),
     required=True,
-    help="Store to write; a new file, ending in .sqlite.",
+    help="Store to write: a new file, ending in .sqlite.",
 )
-@click.option("--prism", help="Take the fixes as one closed session on this prism, so that they become observations.")
+@click.option("--prism", help="Assign all fixes to one closed session on this prism; no session by default.")
 @click.option(
     "--kind", type=click.Choice(SESSION_KINDS), default="static_poses", show_default=True, help="Kind of that session."
 )
@@ -38,11 +38,9 @@ COUNTED = ("joint_samples", "signals", "fixes", "device_events", "decode_failure
     "--session",
     "session_file",
     type=click.Path(path_type=Path),
-    help="In place of both: the session as `rigcal session export` told of it (.json), observed as it was live.",
+    help="Instead of --prism and --kind: session file of `rigcal session export` (.json), to repeat the live session.",
 )
-@click.option(
-    "--readings", type=click.Path(path_type=Path), help="Also write everything that was decoded as JSON lines."
-)
+@click.option("--readings", type=click.Path(path_type=Path), help="File for all decoded data, as JSON lines.")
 @json_option
 def replay(
     files: tuple[Path, ...],
@@ -55,9 +53,10 @@ def replay(
     *,
     as_json: bool,
 ) -> dict[str, Any]:
-    """Feed captured logs through drivers and store at full speed; the same logs give the same rows.
+    """Decode captured logs into a new store at full speed.
 
-    FILES are CAN logs (candump .log, Vector .asc or .blf) and serial captures (.serial).
+    The same logs give the same rows. FILES are CAN logs (candump .log, Vector .asc or .blf) and serial captures
+    (.serial).
     """
     from daemon.cli.log_replay import replay_logs, whole_session
     from daemon.config.config import read_config
@@ -69,7 +68,7 @@ def replay(
     settings = read_config(config)
     source = load_rig(settings.rig, named_in=config)
     if path.exists():
-        raise click.UsageError(f"{path} exists; a replay writes a store of its own, name a new file with --store")
+        raise click.UsageError(f"{path} exists; a replay writes a new store: name a new file with --store")
     if prism is not None and session_file is not None:
         raise click.UsageError("give --prism or --session, not both")
     told = None if session_file is None else read_session_file(session_file)
@@ -86,5 +85,5 @@ def replay(
         if session is not None:
             echo(f"{session['observations']:9d} of these observations can be used")
             for reason, n in session["excluded"].items():
-                echo(f"{n:9d} cannot: {reason}")
+                echo(f"{n:9d} cannot be used: {reason}")
     return counts | ({} if session is None else {"session": session})

@@ -1,4 +1,4 @@
-"""`rigcal report`: the report of a model, also as PDF."""
+"""`rigcal report`: finds the report of a model, and converts it to PDF."""
 
 from __future__ import annotations
 
@@ -22,25 +22,26 @@ LONGEST_BYTES = 256 << 20
     type=click.Path(path_type=Path),
     required=True,
     metavar="DIR",
-    help="What calibrate or gap wrote, a job's directory, or the HTML page itself.",
+    help="Directory of `rigcal calibrate`, of `rigcal gap` or of a job, or the HTML page itself.",
 )
 @click.option(
     "--pdf",
     type=click.Path(path_type=Path, dir_okay=False),
     metavar="OUT",
-    help="Write the report as PDF: numbered A4 pages. Needs the extra `pdf`: pip install 'rigcal[pdf]', and Pango.",
+    help="Write the report to this PDF file, as numbered A4 pages. Requires Pango and the `pdf` extra: pip install "
+    "'rigcal[pdf]'.",
 )
 @json_option
 def report(path: Path, pdf: Path | None, *, as_json: bool) -> dict[str, str]:
-    """Say where the report of a model is, and write it as PDF.
+    """Show the path of a model's report, or write the report as PDF.
 
-    `rigcal jobs list` names the reports of jobs. The HTML page prints well from any browser, too.
+    `rigcal jobs list` shows the reports of jobs. The HTML page can also be printed from any browser.
     """
     from drivers.files import read_text
 
     page = path / REPORT if path.is_dir() else path
     if not page.is_file():
-        raise CommandError(f"{page} is no report; `rigcal jobs list` names those of jobs")
+        raise CommandError(f"{page} is not a report; `rigcal jobs list` shows the reports of jobs")
     told = {"html": str(page)}
     if pdf is not None:
         from daemon.report.pdf import PdfError, pdf_of

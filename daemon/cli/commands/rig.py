@@ -1,4 +1,4 @@
-"""`rigcal rig`: rig files, checked and made from other programs' descriptions."""
+"""`rigcal rig`: checks, imports and exports rig files."""
 
 from __future__ import annotations
 
@@ -23,19 +23,22 @@ _FAULTS_SHOWN = 20
 
 @click.group()
 def rig() -> None:
-    """Rig files: check one, make one from a URDF or a Denavit-Hartenberg table, or write one as such."""
+    """Check, import and export rig files.
+
+    They are converted from or to URDF and Denavit-Hartenberg tables.
+    """
 
 
 @rig.command("check", cls=Command)
 @click.argument("path", metavar="FILE")
-@click.option("--svg", type=click.Path(dir_okay=False, path_type=Path), metavar="OUT", help="Draw the chain as SVG.")
+@click.option("--svg", type=click.Path(dir_okay=False, path_type=Path), metavar="OUT", help="SVG drawing of the chain.")
 @json_option
 def rig_check(path: str, svg: Path | None, *, as_json: bool) -> dict[str, Any]:
-    """Check a rig file (or the name of a shipped rig) and show what it amounts to.
+    """Check a rig file and show the machine that it describes.
 
-    Tells all that is wrong with its line. Of a file that is good: where frames and prisms are with all joints at zero,
-    a drawing of the chain, the reach, the radii that `rigcal plan` keeps clear of, and which parameters the fixes of
-    poses all over the joint limits determine.
+    FILE may also be the name of a shipped rig. All errors are reported with their lines. For a valid file the output
+    has the positions of frames and prisms with all joints at zero, a drawing of the chain, the reach, the radii of
+    links that `rigcal plan` keeps clear of, and the parameters that fixes in poses all over the joint limits determine.
     """
     from calibration.design.rig_check import check_rig
     from calibration.rig.description import read_rig
@@ -64,29 +67,36 @@ def rig_check(path: str, svg: Path | None, *, as_json: bool) -> dict[str, Any]:
 
 @rig.command("import", cls=Command)
 @click.argument("path", type=FILE, metavar="FILE")
-@click.option("--base", metavar="LINK", help="Link that the rig stands on; the URDF's root by default.")
+@click.option("--base", metavar="LINK", help="Base link of the rig; the URDF's root by default.")
 @click.option(
     "--tip",
     "tips",
     multiple=True,
     metavar="LINK",
-    help="Link that carries a prism; the end of every chain by default. May be given again.",
+    help="Link that carries a prism; the end of every chain by default. May be repeated.",
 )
 @click.option(
     "--convention",
     type=click.Choice(_CONVENTIONS),
-    help="How a table's constants are meant; as it says itself, or standard (dh), by default.",
+    help="Convention of a table; by default as stated in the table, or else standard (dh).",
 )
-@click.option("--out", type=click.Path(dir_okay=False, path_type=Path), required=True, metavar="RIG.toml")
+@click.option(
+    "--out",
+    type=click.Path(dir_okay=False, path_type=Path),
+    required=True,
+    metavar="RIG.toml",
+    help="Rig file to write; an existing file is never overwritten.",
+)
 @json_option
 def rig_import(
     path: Path, base: str | None, tips: tuple[str, ...], convention: Any, out: Path, *, as_json: bool
 ) -> dict[str, Any]:
-    """Make a rig file from a URDF (also the output of xacro) or from a Denavit-Hartenberg table (CSV).
+    """Make a rig file from a URDF or a table.
 
-    A URDF gives joints with limits and rates, mimic joints as couplings, fixed transforms, sliding joints, branches,
-    masses, centres of gravity and inertias. What it does not have (errors of encoders, build tolerances, the station,
-    the prisms' places) is assumed, and the file says so. docs/how-to/import-arm.md has the columns of a table.
+    FILE is a URDF (also the output of xacro) or a Denavit-Hartenberg table (CSV). Taken from a URDF are joints with
+    limits and rates, mimic joints as couplings, fixed transforms, prismatic joints, branches, masses, centres of
+    gravity and inertias. Values that it lacks (errors of encoders, build tolerances, the station, the positions of
+    prisms) are assumed and marked as such in the rig file. docs/how-to/import-arm.md lists the columns of a table.
     """
     from calibration.errors import RigError
     from calibration.rig.exchange.from_table import draft_of_table
@@ -95,12 +105,12 @@ def rig_import(
     from drivers.files import read_text
 
     if out.exists():
-        raise CommandError(f"{out} is there already, and is not overwritten; name another file, or remove it")
+        raise CommandError(f"{out} exists and is not overwritten; name a different file, or remove it")
     is_table = path.suffix.lower() == ".csv"
     if is_table and (base or tips):
-        raise click.UsageError("--base and --tip name links of a URDF; a table has none")
+        raise click.UsageError("--base and --tip name links of a URDF; omit them for a table (CSV)")
     if not is_table and convention:
-        raise click.UsageError("--convention is for a table (CSV); a URDF needs none")
+        raise click.UsageError("--convention is for a table (CSV); omit it for a URDF")
     try:
         text = read_text(path, LONGEST)
     except UnicodeDecodeError as error:
@@ -136,13 +146,14 @@ def rig_import(
     type=click.Path(dir_okay=False, path_type=Path),
     required=True,
     metavar="OUT",
-    help="Ends in .urdf, .xacro, or .csv for a Denavit-Hartenberg table.",
+    help="File to write; .urdf, .xacro, or .csv for a Denavit-Hartenberg table.",
 )
 @json_option
 def rig_export(path: str, out: Path, *, as_json: bool) -> dict[str, Any]:
-    """Write a rig file (or a shipped rig) as URDF, xacro or a Denavit-Hartenberg table: the machine by its drawings.
+    """Write a rig as URDF, xacro or Denavit-Hartenberg table.
 
-    `rigcal model export` writes what a calibration found.
+    FILE is a rig file or the name of a shipped rig. The result is the machine according to its drawings; `rigcal model
+    export` writes the result of a calibration.
     """
     import numpy as np
 
@@ -154,7 +165,7 @@ def rig_export(path: str, out: Path, *, as_json: bool) -> dict[str, Any]:
 
     writers = {".urdf": urdf_text, ".xacro": xacro_text, ".csv": dh_text}
     if out.suffix not in writers:
-        raise click.UsageError(f"--out ends in one of {', '.join(writers)}, and {out.name} does not")
+        raise click.UsageError(f"--out must end in one of {', '.join(writers)}, but {out.name} does not")
     rig = load_rig(path).rig
     chain = Chain(rig, {"": Placement.identity()})
     text = writers[out.suffix](chain, np.zeros(len(chain)), [f"Made by `rigcal rig export` from {Path(path).name}."])
@@ -170,7 +181,7 @@ def _show(found: RigCheck) -> None:
 
     rig, seen = found.rig, found.seen
     parts = [counted(len(own), noun) for own, noun in ((rig.rows, "row"), (rig.joints, "joint"), (rig.prisms, "prism"))]
-    echo(f"{rig.name}: good: {', '.join(parts)}", bold=True)
+    echo(f"{rig.name}: valid: {', '.join(parts)}", bold=True)
     places = [(f"frame {n}", place) for n, place in enumerate(found.zero.frames_mm[0]) if n]
     places += [(f"prism {name}", place) for name, place in zip(rig.prism_names, found.zero.prisms_mm[0], strict=True)]
     radii = {f"frame {link.row}": link for link in found.links}
@@ -188,7 +199,7 @@ def _show(found: RigCheck) -> None:
         for line in sketch(found.middle, across):
             echo(f"  {line}")
     echo(
-        f"Reach {found.at.reach_mm:.0f} mm; {found.free_share:.0%} of the poses inside the limits are free of contact "
+        f"Reach {found.at.reach_mm:.0f} mm; {found.free_share:.0%} of the poses within the limits are free of contact "
         f"with machine, base and floor"
     )
     echo(

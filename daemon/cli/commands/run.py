@@ -1,4 +1,4 @@
-"""`rigcal run`: the daemon, with real, simulated or replayed links."""
+"""`rigcal run`: runs the daemon with real, simulated or replayed links."""
 
 from __future__ import annotations
 
@@ -27,34 +27,47 @@ _DWELL = click.FloatRange(1, 600)
 
 @click.command(cls=Command)
 @click.argument("files", nargs=-1, type=click.Path(path_type=Path), metavar="[FILE]...")
-@click.option("--config", type=click.Path(path_type=Path), help="Configuration file (TOML); --sim has one of its own.")
-@click.option("--sim", is_flag=True, help="A simulated rig in place of the configured links.")
-@click.option("--rig", metavar="RIG", help="With --sim: any shipped rig or rig file; joints without a channel get one.")
-@click.option("--replay", "is_replay", is_flag=True, help="The captured logs FILE... in place of the configured links.")
-@click.option("--rate", type=_RATE, default=1.0, show_default=True, help="Speed of the simulation or replay.")
-@click.option("--seed", type=int, default=1, show_default=True, help="Which simulated machine.")
+@click.option("--config", type=click.Path(path_type=Path), help="Configuration file (TOML); optional with --sim.")
+@click.option("--sim", is_flag=True, help="Use a simulated rig instead of the configured links.")
+@click.option(
+    "--rig",
+    metavar="RIG",
+    help="With --sim: name of a shipped rig, or path of a rig file; joints without a channel get a simulated one.",
+)
+@click.option("--replay", "is_replay", is_flag=True, help="Replay the logs FILE... instead of the configured links.")
+@click.option(
+    "--rate", type=_RATE, default=1.0, show_default=True, help="Speed of simulation or replay, seconds per second."
+)
+@click.option("--seed", type=int, default=1, show_default=True, help="Seed of the simulated machine.")
 @click.option(
     "--effect",
     "effects",
     multiple=True,
     metavar="FAMILY@WHERE[:NAME=VALUE...]",
-    help="A hidden effect of the simulated machine, which else has build errors alone, such as "
-    "backlash@theta4:width_rad=4e-3; may be repeated.",
+    help="Hidden effect of the simulated machine, such as backlash@theta4:width_rad=4e-3; by default it has only build "
+    "errors. May be repeated.",
 )
 @click.option(
     "--secret",
     type=click.Path(file_okay=False, path_type=Path),
     metavar="DIR",
-    help="Hide one more effect, which the simulated machine draws and names in a file there.",
+    help="Hide one more effect, which the simulated machine draws at random and records in a file in DIR.",
 )
-@click.option("--dwell", "dwell_s", type=_DWELL, default=4.0, show_default=True, help="Simulated stand at a pose, s.")
+@click.option(
+    "--dwell",
+    "dwell_s",
+    type=_DWELL,
+    default=4.0,
+    show_default=True,
+    help="How long the simulated boom stands still at each pose, simulated seconds.",
+)
 @click.option(
     "--by-hand",
     "is_by_hand",
     is_flag=True,
-    help="Boom and station of the simulated rig move only as `rigcal hand` says: to practise an operator's work.",
+    help="Boom and station of the simulated rig move only on `rigcal hand`, to practise an operator's work.",
 )
-@click.option("-v", "--verbose", is_flag=True, help="Log more.")
+@click.option("-v", "--verbose", is_flag=True, help="Also log debug messages.")
 @json_option
 def run(
     files: tuple[Path, ...],
@@ -72,10 +85,10 @@ def run(
     verbose: bool,
     as_json: bool,
 ) -> dict[str, Any]:
-    """Run the daemon until it is told to stop (SIGTERM, Ctrl-C) or a replay has ended.
+    """Run the daemon until it is stopped.
 
-    A replay keeps its store in a directory of its own, beside the configured one's. A simulated rig is refused on the
-    store of a real one, and the other way round.
+    SIGTERM or Ctrl-C stops it, or the end of a replay. A replay writes its store to a new directory within the
+    configured state directory. A simulated rig is refused on the store of a real rig, and the reverse.
     """
     if not sim and (is_by_hand or rig is not None):
         raise click.UsageError("--rig and --by-hand are for a simulated rig: give --sim as well")
@@ -86,7 +99,7 @@ def run(
 
     set_up_logging(level=logging.DEBUG if verbose else logging.INFO)
     if not verbose:
-        logging.getLogger("can").setLevel(logging.WARNING)  # python-can tells of every socket that it makes
+        logging.getLogger("can").setLevel(logging.WARNING)  # python-can logs every socket that it creates
     if bool(files) != is_replay or (sim and is_replay):
         raise click.UsageError("give either --sim, or --replay FILE..., or neither")
     if config is not None:
@@ -104,7 +117,7 @@ def run(
         stack.callback(stop_on_signals(stop))
         with notifier.extending(f"opening the store {settings.store_path}"):
             _make_directory(settings)
-            # The store first: its lock keeps a second daemon from touching anything of the first one's.
+            # Open the store first: its lock prevents a second daemon from interfering with the first.
             store = stack.enter_context(contextlib.closing(_store(settings, is_simulated=sim)))
             if sim:
                 machine = simulated(
@@ -132,7 +145,7 @@ def run(
 
 
 def _store(settings: Config, *, is_simulated: bool) -> Store:
-    """Open the store for writing; CommandError if it holds records of a real machine, and a simulated one is to run."""
+    """Open the store for writing; CommandError if its records are real and the run is simulated, or the reverse."""
     from daemon.composition import require_apart
     from daemon.store.store import Store
 
@@ -152,7 +165,7 @@ def _simulated_settings() -> Config:
 
 
 def _write_config(settings: Config, rig: str) -> None:
-    """Write the configuration of a simulated rig beside its store."""
+    """Write the configuration of a simulated rig to the directory of its store."""
     from calibration.rig.description import shipped_rigs
     from daemon.host.safe_output import write_file
 
@@ -176,7 +189,7 @@ def _make_directory(settings: Config) -> None:
 
 
 def _apart(settings: Config) -> Config:
-    """Return the configuration with a new state directory: a replayed log stays apart from the rig's own records."""
+    """Return the configuration with a new state directory, to keep replayed logs apart from the rig's records."""
     _make_directory(settings)
     directory = Path(tempfile.mkdtemp(prefix="replay-", dir=settings.state_directory))
     return settings.model_copy(update={"state_directory": directory, "socket": directory / "control.sock"})

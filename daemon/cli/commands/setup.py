@@ -14,26 +14,32 @@ from daemon.cli.terminal import echo, echo_table
 
 @click.group()
 def setup() -> None:
-    """Station set-ups: where and how the total station stands."""
+    """Record and list set-ups of the total station."""
 
 
 @setup.command(cls=Command, name="new")
 @click.argument("name")
 @click.option("--instrument", default="", help="Maker and model.")
 @click.option("--serial", default="", help="Serial number.")
-@click.option("--tilt-arcsec", type=float, help="Residual tilt shown after levelling.")
-@click.option("--ppm", type=float, help="Atmospheric correction set on the instrument.")
-@click.option("--prism-constant", multiple=True, metavar="PRISM=MM", help="Prism constant set for a prism.")
+@click.option("--tilt-arcsec", type=float, help="Residual tilt shown after levelling, arcsec.")
+@click.option("--ppm", type=float, help="Atmospheric correction set on the instrument, ppm.")
+@click.option(
+    "--prism-constant",
+    multiple=True,
+    metavar="PRISM=MM",
+    help="Prism constant set on the instrument for a prism, mm. May be repeated.",
+)
 @click.option(
     "--control-point",
     multiple=True,
     metavar="NAME=X,Y,Z",
-    help="Known place of a control point in the station's frame, mm; without one its first shot defines it.",
+    help="Known position of a control point in the station's frame, mm; by default its first shot defines it. May be "
+    "repeated.",
 )
-@click.option("--note", default="")
+@click.option("--note", default="", help="Remark, stored with the set-up.")
 @client_options
 def setup_new(prism_constant: tuple[str, ...], control_point: tuple[str, ...], **options: Any) -> Any:
-    """Describe where the station stands now. A station that was moved is a new set-up."""
+    """Record a new set-up, NAME, whenever the station was moved."""
     where = {key: options.pop(key) for key in ("socket", "config", "as_json")}
     constants = _assignments("--prism-constant", prism_constant, "r=-30", 1)
     return ask(
@@ -70,7 +76,7 @@ def setup_list(**where: Any) -> Any:
 
 def _show(setups: Sequence[Mapping[str, Any]]) -> None:
     if not setups:
-        echo("no set-ups yet; describe one with `rigcal setup new`")
+        echo("no set-ups yet; `rigcal setup new` records one")
         return
     rows = []
     for setup in setups:

@@ -1,4 +1,4 @@
-"""`rigcal simulate`: observations of a simulated machine of any rig."""
+"""`rigcal simulate`: simulates observations of a machine of any rig."""
 
 from __future__ import annotations
 
@@ -20,25 +20,26 @@ _MOST_POSES = 100_000
 
 @click.command(cls=Command)
 @rig_option
-@click.option("--poses", type=click.IntRange(1, _MOST_POSES), required=True, metavar="N", help="How many poses.")
+@click.option("--poses", type=click.IntRange(1, _MOST_POSES), required=True, metavar="N", help="Number of poses.")
 @seed_option
 @click.option(
-    "--plan", type=FILE, metavar="CSV", help="Take the poses of a plan; random ones in the limits by default."
+    "--plan", type=FILE, metavar="CSV", help="Plan with the poses; random poses within the limits by default."
 )
 @click.option(
     "--effect",
     "effects",
     multiple=True,
     metavar="FAMILY@WHERE[:NAME=VALUE...]",
-    help="A hidden effect of the machine, which else has build errors alone; `rigcal effects` lists them. May be given "
-    "again.",
+    help="Hidden effect of the machine; by default it has only build errors. `rigcal effects` lists them. May be "
+    "repeated.",
 )
 @click.option(
     "--noise",
     "noise_mm",
     type=FiniteRange(min=LEAST_SIGMA_MM),
     metavar="MM",
-    help="Standard deviation of each coordinate of a fix, also stated in the data; the rig file's station by default.",
+    help="Standard deviation of each coordinate of a fix, also stated in the data; from the rig file's station by "
+    "default.",
 )
 @click.option(
     "--recording",
@@ -46,15 +47,21 @@ _MOST_POSES = 100_000
     default=0,
     show_default=True,
     metavar="K",
-    help="Another number measures the same machine in other poses: data to hold out.",
+    help="Number of the recording; a different number measures the same machine in different poses, as held-out data.",
 )
-@click.option("--out", type=click.Path(dir_okay=False, path_type=Path), required=True, metavar="CSV")
+@click.option(
+    "--out",
+    type=click.Path(dir_okay=False, path_type=Path),
+    required=True,
+    metavar="CSV",
+    help="Observations CSV to write.",
+)
 @click.option(
     "--truth",
     "truth_out",
     type=click.Path(dir_okay=False, path_type=Path),
     metavar="JSON",
-    help="Write what the machine really is, to hold a calibration against.",
+    help="Also write the true machine to this file, to compare a calibration with it.",
 )
 @json_option
 def simulate(
@@ -70,11 +77,11 @@ def simulate(
     *,
     as_json: bool,
 ) -> dict[str, Any]:
-    """Simulate a machine of a rig and measure it: observations for `rigcal calibrate`, without any hardware.
+    """Simulate observations of a machine.
 
-    The machine is built within the tolerances of the rig file, by the seed, and has the effects that are asked for. It
-    stands still in each pose and all prisms are measured, with the random errors of station and encoders. Its physics
-    share no code with the analysis.
+    They are input for `rigcal calibrate` without any hardware. The seed draws a machine within the tolerances of the
+    rig file; the given effects are added to it. It stands still in each pose and all prisms are measured, with random
+    errors of station and encoders. Its physics share no code with the analysis.
     """
     from daemon.composition import simulated_campaign
     from daemon.rig_files import load_rig
@@ -98,9 +105,9 @@ def simulate(
         result["truth"] = str(truth_out)
     if not as_json:
         echo(
-            f"{out}: {len(observed)} fixes in {poses} poses; no model can be nearer to them than "
+            f"{out}: {len(observed)} fixes in {poses} poses; the error of any model is at least "
             f"{number(observed.noise_rms_mm)} mm RMS, the noise of station and encoders"
         )
         if truth_out is not None:
-            echo(f"What the machine really is: {truth_out}")
+            echo(f"True machine: {truth_out}")
     return result

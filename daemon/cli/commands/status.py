@@ -1,4 +1,4 @@
-"""`rigcal status`: the state on one screen, or in full."""
+"""`rigcal status`: the rig's state on one screen, or in full."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ from daemon.cli.lines.summary import state_sentence, summary
 from daemon.cli.terminal import Coloured, echo, echo_table
 from daemon.next_step import next_line
 
-WIDTH = 100  # where the terminal's is not known
+WIDTH = 100  # if the terminal's width is unknown
 
 
 @click.command(cls=Command)
-@click.option("--all", "everything", is_flag=True, help="Also every link, channel and event.")
-@click.option("--frames", is_flag=True, help="Everything, and every CAN identifier that was heard, with its rate.")
+@click.option("--all", "everything", is_flag=True, help="Also show all links, channels and events.")
+@click.option("--frames", is_flag=True, help="Show all, and every received CAN identifier with its rate in frames/s.")
 @client_options
 def status(everything: bool, frames: bool, **where: Any) -> Any:
-    """Show on one screen what the rig is doing, what is wrong, and what to do next."""
+    """Show the rig's state, its faults and the next step."""
     show = partial(_show_all, frames=frames) if everything or frames else _show
     told = ask(where, "status", show, STATUS_TIMEOUT_S)
     return told | {"summary": {"state": state_sentence(told), "next": next_line(told)}}

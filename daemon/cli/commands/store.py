@@ -1,4 +1,4 @@
-"""`rigcal store`: what the store holds, whether it is sound, its backups, and what it keeps."""
+"""`rigcal store`: contents, integrity, backups and pruning of the store."""
 
 from __future__ import annotations
 
@@ -19,44 +19,47 @@ if TYPE_CHECKING:
     from daemon.config.config import Config
     from daemon.store import Store
 
-TIMEOUT_S = 86_400.0  # a command that deletes a year, or decodes a week again; Ctrl-C ends it
+TIMEOUT_S = 86_400.0  # for deleting a year, or decoding a week again; Ctrl-C cancels
 _MIB = 2**20
 
 
 @click.group()
 def store() -> None:
-    """The store: its size, its soundness, its backups, and what it keeps."""
+    """Check, back up, restore, prune and describe the store."""
 
 
 @store.command(cls=Command, name="stats")
-@click.option("--tables", is_flag=True, help="Also the size of each table and index; reads the whole store.")
+@click.option("--tables", is_flag=True, help="Also show the size of each table and index (reads the whole store).")
 @config_option
 @json_option
 def store_stats(config: Path, *, tables: bool, as_json: bool) -> dict[str, Any]:
-    """Show how large the store is and what it holds."""
+    """Show the size and the contents of the store."""
     from daemon.config.config import read_config
     from daemon.store.upkeep.statistics import statistics
 
     found = statistics(read_config(config).store_path, tables=tables)
     if not as_json:
         echo(f"{found['store']}: {_size(found['file_bytes'])}, of which {_size(found['free_inside_bytes'])} will be")
-        echo(f"used again; {_size(found['disk_free_bytes'])} are free on its disk")
+        echo(f"reused; {_size(found['disk_free_bytes'])} are free on its disk")
         if found["oldest_utc_ns"] is not None:
             echo(f"captures from {utc(found['oldest_utc_ns'])} to {utc(found['newest_utc_ns'])}")
-        echo(f"{counted(found['chunks'], 'chunk')} of captures, {found['small_chunks']} of them wait to be packed")
+        echo(f"{counted(found['chunks'], 'chunk')} of captures, {found['small_chunks']} of them waiting to be packed")
         held = f"{counted(found['sessions'], 'session')}, {counted(found['boots'], 'boot')}"
-        echo(f"{found['undecoded_chunks']} wait to be decoded; {held}")
+        echo(f"{found['undecoded_chunks']} waiting to be decoded; {held}")
         for name, size in (found.get("tables") or {}).items():
             echo(f"  {name:32} {size / _MIB:12.2f} MiB")
     return found
 
 
 @store.command(cls=Command, name="describe")
-@click.option("--out", type=click.Path(dir_okay=False, path_type=Path), help="The file; standard output by default.")
+@click.option("--out", type=click.Path(dir_okay=False, path_type=Path), help="File; standard output by default.")
 @config_option
 @json_option
 def store_describe(config: Path, out: Path | None, *, as_json: bool) -> dict[str, Any]:
-    """Write the metadata.yaml with which Datasette shows the store: titles, meanings of columns, queries."""
+    """Write a metadata.yaml for Datasette.
+
+    It has titles, descriptions of columns, and queries.
+    """
     from daemon.config.config import read_config
     from daemon.host.safe_output import write_file
     from daemon.store.describe.description import describe_store
@@ -72,13 +75,14 @@ def store_describe(config: Path, out: Path | None, *, as_json: bool) -> dict[str
 
 
 @store.command(cls=Command, name="check")
-@click.option("--backup", type=click.Path(path_type=Path), help="Check this backup in place of the store.")
+@click.option("--backup", type=click.Path(path_type=Path), help="Check this backup instead of the store.")
 @config_option
 @json_option
 def store_check(config: Path, backup: Path | None, *, as_json: bool) -> Delivered:
-    """Look for damage: the database, every chunk of captures, the live model. The daemon may run.
+    """Check the store and the live model for damage.
 
-    Exit status 1 where something is damaged.
+    The database and all chunks of captures are checked. The daemon may run in the meantime. The exit status is 1 if
+    something is damaged.
     """
     from daemon.config.config import read_config
     from daemon.store.upkeep import backup as backup_module
@@ -91,10 +95,10 @@ def store_check(config: Path, backup: Path | None, *, as_json: bool) -> Delivere
         path, models = backup / backup_module.STORE, backup / backup_module.MODELS
     found = check_store(path, models)
     if not as_json:
-        echo(f"{path}: {found.captures} captures in {found.chunks} chunks, {found.models} live models looked at")
+        echo(f"{path}: checked {found.captures} captures in {found.chunks} chunks, {found.models} live models")
         for finding in found.findings:
             echo(f"  damaged: {finding}", fg="red")
-        echo("restore the store from a backup: `rigcal store restore`" if found.findings else "all is sound")
+        echo("restore the store from a backup: `rigcal store restore`" if found.findings else "no damage found")
     result = {
         "store": str(path),
         "is_sound": not found.findings,
@@ -108,14 +112,17 @@ def store_check(config: Path, backup: Path | None, *, as_json: bool) -> Delivere
 
 @store.command(cls=Command, name="backup")
 @click.option(
-    "--to", type=click.Path(file_okay=False, path_type=Path), help="Directory of backups; the configured one."
+    "--to", type=click.Path(file_okay=False, path_type=Path), help="Directory of backups; as configured by default."
 )
-@click.option("--keep", type=click.IntRange(1), help="How many backups stay there; as configured.")
-@click.option("--list", "is_list", is_flag=True, help="List the backups and make none.")
+@click.option("--keep", type=click.IntRange(1), help="Number of backups to keep there; as configured by default.")
+@click.option("--list", "is_list", is_flag=True, help="List the backups without making one.")
 @config_option
 @json_option
 def store_backup(config: Path, to: Path | None, keep: int | None, *, is_list: bool, as_json: bool) -> dict[str, Any]:
-    """Copy store and models to a backup, verify it, and delete the oldest ones. The daemon may run."""
+    """Make and verify a backup of store and models.
+
+    Backups beyond the number to keep are deleted, the oldest first. The daemon may run in the meantime.
+    """
     from daemon.config.config import read_config
     from daemon.store.upkeep.backup import backups, make_backup
 
@@ -150,9 +157,10 @@ def store_backup(config: Path, to: Path | None, keep: int | None, *, is_list: bo
 @config_option
 @json_option
 def store_restore(backup: Path, config: Path, *, as_json: bool) -> dict[str, Any]:
-    """Put BACKUP, a directory that `rigcal store backup` made, in the place of store and models.
+    """Restore store and models from a backup.
 
-    Stop the daemon first. What was there is moved to a directory beside the store and nothing of it is deleted.
+    BACKUP is a directory that `rigcal store backup` made. Stop the daemon first. The previous files are moved to a
+    directory next to the store, and none is deleted.
     """
     from daemon.config.config import read_config
     from daemon.store.upkeep.backup import restore_backup
@@ -160,21 +168,21 @@ def store_restore(backup: Path, config: Path, *, as_json: bool) -> dict[str, Any
     settings = read_config(config)
     aside = restore_backup(backup, settings.store_path, settings.models_directory, _now_ns(), _go_on)
     if not as_json:
-        echo(f"{settings.store_path} is now that of {backup}")
+        echo(f"{settings.store_path} is restored from {backup}")
         if aside is not None:
-            echo(f"what was there before is in {aside}; delete it once all is well")
+            echo(f"the previous files are in {aside}; delete them when they are no longer needed")
     return {"store": str(settings.store_path), "replaced": None if aside is None else str(aside)}
 
 
 @store.command(cls=Command, name="prune")
-@click.option("--days", type=click.FloatRange(1), help="Keep so many days; `keep_days` of the configuration.")
+@click.option("--days", type=click.FloatRange(1), help="Days to keep; `keep_days` of the configuration by default.")
 @config_option
 @json_option
 def store_prune(config: Path, days: float | None, *, as_json: bool) -> dict[str, Any]:
-    """Delete captures and readings outside sessions that are older than so many days. The daemon may run.
+    """Delete old captures and readings outside sessions.
 
-    Sessions, what was captured in them and a minute before, and models always stay. The file does not become smaller:
-    its free pages are used again.
+    Sessions with their captures, from a minute before their start, and models are always kept. The file does not
+    shrink; its free pages are reused. The daemon may run in the meantime.
     """
     from daemon.config.config import read_config
     from daemon.service import keeping_of
@@ -194,23 +202,24 @@ def store_prune(config: Path, days: float | None, *, as_json: bool) -> dict[str,
     result = _on_store(settings, work, "store.prune", arguments)
     if not as_json:
         until_ns = result["deleted_until_utc_ns"]
-        echo("nothing to delete" if until_ns is None else f"deleted what lies outside sessions up to {utc(until_ns)}")
+        echo("nothing to delete" if until_ns is None else f"deleted records outside sessions up to {utc(until_ns)}")
     return result
 
 
 @store.command(cls=Command, name="redecode")
-@click.option("--session", help="All readings and fixes of this session.")
-@click.option("--from", "since", type=click.DateTime(), help="Begin of a time, UTC, in place of a session.")
-@click.option("--to", "until", type=click.DateTime(), help="Its end, UTC.")
+@click.option("--session", help="Session to decode.")
+@click.option("--from", "since", type=click.DateTime(), help="Start of a time span, UTC, instead of a session.")
+@click.option("--to", "until", type=click.DateTime(), help="End of the time span, UTC.")
 @config_option
 @json_option
 def store_redecode(
     config: Path, session: str | None, since: datetime | None, until: datetime | None, *, as_json: bool
 ) -> dict[str, Any]:
-    """Make every reading and fix of a session, or of some time, again from raw captures. The daemon may run.
+    """Decode raw captures again into readings and fixes.
 
-    Outside sessions the store has one reading a second and channel; raw captures have them all. A time is taken with
-    the whole chunks of captures that it touches, so that more than it may be decoded.
+    Give a session or a time span. Outside sessions the store keeps one reading per second and channel; raw captures
+    have all readings. All chunks of captures that overlap the time span are decoded, so the result may extend beyond
+    it. The daemon may run in the meantime.
     """
     from daemon.acquisition.channel_files import with_files
     from daemon.acquisition.redecoding import redecode_command
@@ -240,22 +249,22 @@ def store_redecode(
         for stretch in result["stretches"]:
             echo(f"decoded again: {utc(stretch['first_utc_ns'])} to {utc(stretch['last_utc_ns'])}")
         echo(f"{result['added']} readings and fixes more than before")
-        if not result.get("is_whole", True):  # an older daemon does not say
-            echo("what is younger waits to be decoded for the first time; ask again when that is done")
+        if not result.get("is_whole", True):  # an older daemon does not send it
+            echo("later captures are still waiting to be decoded for the first time; repeat the command afterwards")
     return result
 
 
 def _on_store(
     settings: Config, work: Callable[[Store], dict[str, Any]], command: str, arguments: dict[str, Any]
 ) -> dict[str, Any]:
-    """Change the store: through the daemon where one writes to it, or where it alone may; else here."""
+    """Change the store: through the daemon if it runs or if only it has write permission, else in this process."""
     from daemon.control.protocol import request
     from daemon.store import Store, StoreBusyError, StoreError
 
     path, opened = settings.store_path, None
     if not path.parent.exists() or os.access(path.parent, os.W_OK):
         if not path.is_file():
-            raise StoreError(f"{path}: there is no store")
+            raise StoreError(f"{path}: there is no store; check --config")
         with contextlib.suppress(StoreBusyError):
             opened = Store(path)
     if opened is None:
@@ -270,13 +279,13 @@ def _on_store(
 def _told(path: Path) -> Iterator[None]:
     from daemon.store.errors import storage_errors
 
-    echo_error(f"no daemon runs on {path}: it is changed here")
+    echo_error(f"no daemon is running on {path}: changing the store directly")
     with storage_errors(path):
         yield
 
 
 def _go_on() -> None:
-    """Ctrl-C ends what runs here by itself."""
+    """Do nothing: Ctrl-C ends this process anyway."""
 
 
 def _now_ns() -> int:

@@ -1,4 +1,4 @@
-"""`rigcal tip`: the present position of a prism, by the live model."""
+"""`rigcal tip`: the present position of a prism, predicted by the live model."""
 
 from __future__ import annotations
 
@@ -17,15 +17,16 @@ FOLLOW_S = 0.2
 
 
 @click.command(cls=Command)
-@click.option("--prism", help="Which prism; the configured one ([tip] prism) by default.")
-@click.option("--follow", is_flag=True, help="Again and again, five times a second, until stopped.")
+@click.option("--prism", help="Name of the prism; the configured one ([tip] prism) by default.")
+@click.option("--follow", is_flag=True, help="Show the position five times a second until Ctrl-C.")
 @client_options
 def tip(prism: str | None, *, follow: bool, **where: Any) -> Any:
-    """Show where a prism is now: the joints' latest readings through the live model.
+    """Show the present position of a prism.
 
-    The position is in the base frame, and in the station's, as it would measure the prism, if the model knows its
-    set-up. If the position is not known, the exit status is 1 and the reason says what to do; --follow goes on. With
-    --follow and --json, standard output holds one object a line.
+    The live model predicts it from the latest joint readings. The position is given in the base frame and, if the model
+    knows the station's set-up, in the station's frame as it would measure the prism. If the position is unknown, the
+    exit status is 1 and the reason says what to do; --follow continues. With --follow and --json, each line of standard
+    output is one object.
     """
     arguments = {} if prism is None else {"prism": prism}
     socket = socket_of(where["socket"], where["config"])
@@ -55,7 +56,7 @@ def _show(tip: dict[str, Any]) -> None:
         return
     line = f"prism {tip['prism']}: base {_place(tip['base_mm'])} mm, sigma {tip['sigma_mm']:.1f} mm"
     if tip["setup"] is None:
-        line += "; in no station's frame: the model does not know where the station stands"
+        line += "; not in a station's frame: the model does not know the station's set-up"
     else:
         line += f"; station {tip['setup']} {_place(tip['station_mm'])} mm"
     echo(f"{line}; {tip['age_s']:.2f} s ago, model {tip['model']}, {tip['status']}")
@@ -64,7 +65,7 @@ def _show(tip: dict[str, Any]) -> None:
 
 
 def _unknown(tip: dict[str, Any]) -> str:
-    remedy = "; `rigcal status` says what leads to a live model" if tip["status"] == "no_model" else ""
+    remedy = "; `rigcal status` shows the next step to a live model" if tip["status"] == "no_model" else ""
     status = "" if tip["status"] == "no_model" else f"{tip['status'].replace('_', ' ')}: "
     return f"prism {tip['prism']}: {status}{tip['reason']}{remedy}"
 

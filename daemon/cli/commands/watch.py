@@ -31,15 +31,16 @@ WIDTH = 100
     default=1.0,
     show_default=True,
     metavar="SECONDS",
-    help="Between two looks.",
+    help="Time between updates.",
 )
-@click.option("--count", type=click.IntRange(min=1), help="End after so many looks; goes on until Ctrl-C by default.")
+@click.option("--count", type=click.IntRange(min=1), help="End after this many updates; no end by default.")
 @client_options
 def watch(interval_s: float, count: int | None, **where: Any) -> None:
-    """Show joints, station, rates, open session, alarms and jobs, again and again until Ctrl-C.
+    """Show the rig's state continuously until Ctrl-C.
 
-    On a terminal the screen is refreshed. Elsewhere each look is one line, with --json one object. A daemon that does
-    not answer is said to be lost, and asked again.
+    The state has joints, station, rates, open session, alarms and jobs. On a terminal the screen is updated. Otherwise
+    each update is one line, with --json one object. If the daemon does not answer, this is shown, and the connection is
+    retried.
     """
     is_screen = sys.stdout.isatty() and not where["as_json"]
     socket = socket_of(where["socket"], where["config"])
@@ -63,7 +64,7 @@ def watch(interval_s: float, count: int | None, **where: Any) -> None:
     finally:
         if is_screen:
             end_screen()
-    raise click.exceptions.Exit(0)  # nothing is left to be printed as the one result
+    raise click.exceptions.Exit(0)  # there is no final result to print
 
 
 def one_line(status: Mapping[str, Any]) -> str:
@@ -81,11 +82,11 @@ def one_line(status: Mapping[str, Any]) -> str:
 
 
 def _look(socket: Any) -> tuple[Mapping[str, Any] | None, str]:
-    """Return the daemon's state; None with the reason where it does not answer."""
+    """Return the daemon's state, or None with the reason if it does not answer."""
     try:
         return request(socket, "status", timeout_s=STATUS_TIMEOUT_S), ""
     except CommandError as error:
-        return None, f"connection lost, trying again: {error}"
+        return None, f"connection lost, retrying: {error}"
 
 
 def _draw(status: Mapping[str, Any] | None, fault: str) -> None:

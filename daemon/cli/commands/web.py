@@ -1,4 +1,4 @@
-"""`rigcal web`: the operator's page, and the tokens that let people in."""
+"""`rigcal web`: serves the operator's page, and manages its access tokens."""
 
 from __future__ import annotations
 
@@ -23,22 +23,27 @@ _FILE = click.Path(dir_okay=False, path_type=Path)
 
 
 @click.group(invoke_without_command=True)
-@click.option("--host", help="Address to serve at.  [default: 127.0.0.1, or as [web] says]")
-@click.option("--port", type=click.IntRange(0, 65535), help="Port; 0: any that is free.  [default: 8370]")
-@click.option("--certificate", type=_FILE, help="PEM file; needed wherever other computers reach the page.")
+@click.option("--host", help="Address to serve at.  [default: host of [web], or 127.0.0.1]")
+@click.option("--port", type=click.IntRange(0, 65535), help="Port; 0 for any free port.  [default: 8370]")
+@click.option("--certificate", type=_FILE, help="PEM file of the certificate; required if other computers have access.")
 @click.option("--key", type=_FILE, help="PEM file of the certificate's key.")
-@click.option("--socket", type=click.Path(path_type=Path, readable=False), help="Control socket of the daemon.")
-@click.option("--config", type=_CONFIG, help="Configuration of the daemon; its [web] says where to serve.")
+@click.option(
+    "--socket",
+    type=click.Path(path_type=Path, readable=False),
+    help="Control socket of the daemon; by default as for other commands.",
+)
+@click.option("--config", type=_CONFIG, help="Configuration of the daemon; its section [web] has the address.")
 @click.option(
     "--loopback-role",
     type=_ROLES,
-    help="Most that anyone may do who opens the page on this computer without a token.  [default: what you may do]",
+    help="Highest role of anyone who opens the page on this computer without a token.  [default: your own permissions]",
 )
 def web(**options: Any) -> None:
-    """Serve the operator's page until stopped; `rigcal web token` lets people in from elsewhere.
+    """Serve the operator's page until stopped.
 
-    On a loopback address the page needs no token: who opens it may do what the user may who started it. Any other
-    address needs TLS, and everybody a token (docs/how-to/operator-page.md).
+    `rigcal web token` manages access from other computers. On a loopback address the page needs no token: whoever opens
+    it has the permissions of the user who started it. Any other address requires TLS and a token for each person
+    (docs/how-to/operator-page.md).
     """
     ctx = click.get_current_context()
     if ctx.invoked_subcommand is None:
@@ -60,7 +65,7 @@ def _serve(**options: Any) -> None:
 
 @web.group()
 def token() -> None:
-    """Tokens: who may open the page, and what they may do there."""
+    """Manage access tokens of the operator's page."""
 
 
 def _token_options(command: Callable[..., Any]) -> Callable[..., Any]:
@@ -69,10 +74,15 @@ def _token_options(command: Callable[..., Any]) -> Callable[..., Any]:
 
 @token.command(cls=Command, name="add")
 @click.argument("name")
-@click.option("--role", type=_ROLES, required=True, help="read: look; operate: measure; approve: put models live, too.")
+@click.option(
+    "--role", type=_ROLES, required=True, help="read: view; operate: also measure; approve: also accept models."
+)
 @_token_options
 def token_add(name: str, role: str, config: Path, *, as_json: bool) -> dict[str, str]:
-    """Make a token for NAME and print it: it is shown this once, and only its hash is kept."""
+    """Make a token for NAME and print it.
+
+    It is shown only once, as only its hash is stored.
+    """
     from daemon.web.access import Role
     from drivers.clock import SystemClock
 
@@ -86,17 +96,17 @@ def token_add(name: str, role: str, config: Path, *, as_json: bool) -> dict[str,
 @click.argument("name")
 @_token_options
 def token_remove(name: str, config: Path, *, as_json: bool) -> dict[str, str]:
-    """Remove the token of NAME: whoever uses it is refused from now on."""
+    """Remove the token of NAME, which is refused from now on."""
     _tokens(config).remove(name)
     if not as_json:
-        echo(f"the token of {name} counts no more")
+        echo(f"the token of {name} is removed")
     return {"removed": name}
 
 
 @token.command(cls=Command, name="list")
 @_token_options
 def token_list(config: Path, *, as_json: bool) -> dict[str, Any]:
-    """List whose tokens there are, with their roles."""
+    """List the names and roles of all tokens."""
     entries = _tokens(config).entries()
     if not as_json:
         if entries:

@@ -1,1 +1,1 @@
-"""The demonstration: an operator of the simulated rig, and the search for the effect that it hides."""
+"""The demonstration: an operator of the simulated rig, and the search for its hidden effect."""

@@ -1,7 +1,6 @@
-"""`rigcal demo --hidden`: the gap workflow looks for an effect that the simulated machine draws by its seed.
+"""`rigcal demo --hidden`: the gap workflow searches for an effect that the simulated machine draws from its seed.
 
-The truth is in a file that the analysis is not given. The analysis sees observations as they are exported from the
-store.
+The truth is in a file that the analysis does not get. The analysis sees only observations exported from the store.
 """
 
 from __future__ import annotations
@@ -25,14 +24,14 @@ from daemon.store.queries.observations import first_observation
 from daemon.store.reader import Reader
 from drivers.clock import NS_PER_S
 
-NO_JOBS = "\n[jobs]\nenabled = false  # the workflow is asked by rigcal gap, before and after the poses it proposes\n"
-TRAINING_POSES = 22  # of each prism
-CHECKED = ("r", "b")  # prisms of the checks, and of the poses that are proposed
+NO_JOBS = "\n[jobs]\nenabled = false  # `rigcal gap` is run instead, before and after the poses that it proposes\n"
+TRAINING_POSES = 22  # for each prism
+CHECKED = ("r", "b")  # prisms of the checks and of the proposed poses
 CHECK_POSES = 4
-GAP_STEPS = 40  # of progress, for what takes about as long as so many poses
+GAP_STEPS = 40  # progress steps of `rigcal gap`, which takes about as long as this many poses
 PROPOSED = 20
 STORE = "rigcal.sqlite"
-LONGEST_S = 1800.0  # simulated, that the rounds of the proposed poses may be apart, first to last
+LONGEST_S = 1800.0  # longest simulated time from the first to the last round of the proposed poses
 HIDDEN = "hidden_effect.json"
 
 Outcome = Literal["right", "set", "missed"]
@@ -44,9 +43,9 @@ class Truth:
 
     Attributes:
         family, where: its name and place.
-        coefficients: name -> value, as the simulator has it.
+        coefficients: name -> value in the simulator.
         visible_over_noise: RMS of the part that calibration cannot absorb, in units of a fix's noise.
-        begin_utc_ns: simulated second 0, from which its instants count.
+        begin_utc_ns: time of simulated second 0, from which its times count.
     """
 
     family: str
@@ -57,21 +56,21 @@ class Truth:
 
 
 def steps() -> int:
-    """Number of progress steps, without poses that a set may ask for."""
+    """Return the number of progress steps, without poses that may be proposed for a set."""
     return len(PRISMS) * TRAINING_POSES + len(CHECKED) * CHECK_POSES + GAP_STEPS
 
 
 def play(out: Path, rate: float, seed: int, advance: Advance) -> dict[str, Any]:
-    """Play the whole game; everything is left in `out`.
+    """Run the whole demonstration and leave all files in `out`.
 
     Args:
-        out: a new directory, absolute.
+        out: absolute path of a new directory.
         rate: simulated seconds per second.
-        seed: which machine, and which effect.
-        advance: told of progress.
+        seed: determines the machine and the effect.
+        advance: called with the progress.
 
     Raises:
-        DemoError: it did not come to its end.
+        DemoError: the demonstration did not finish.
     """
     from daemon.models.gap_files import REPORT
 
@@ -79,23 +78,23 @@ def play(out: Path, rate: float, seed: int, advance: Advance) -> dict[str, Any]:
     operator = Operator(out, rate, seed, ["--secret", str(out)], NO_JOBS)
     try:
         operator.begin()
-        echo_error(f"An effect is hidden in the machine. {HIDDEN} names it; the analysis is not given that file.")
+        echo_error(f"An effect is hidden in the machine. {HIDDEN} names it; the analysis does not get that file.")
         training = [operator.record(prism, "static_poses", TRAINING_POSES, advance) for prism in PRISMS]
         checks = [operator.record(prism, "check", CHECK_POSES, advance) for prism in CHECKED]
-        advance("waiting for `rigcal gap`, which looks for missing physics", 0)
+        advance("waiting for `rigcal gap`, which searches for missing effects", 0)
         name = "gap"
         found = [_find_gap(out, rig, name, training, checks, seed)]
         advance("an answer of `rigcal gap`", GAP_STEPS)
         poses = _proposed(found[0])
         if poses:
-            echo_error(f"The data cannot tell {_set_of(found[0])} apart. Measuring {len(poses)} poses that can.")
+            echo_error(f"The data cannot distinguish {_set_of(found[0])}. Measuring {len(poses)} poses that can.")
             for sentence in concessions(rig, poses):
                 echo_error(sentence)
             for pause_s, rows in rounds(poses):
                 advance("waiting for the next round", 0)
                 operator.pause(pause_s)
                 training += [operator.record(prism, "static_poses", len(rows), advance, rows) for prism in CHECKED]
-            advance("waiting for `rigcal gap` again, with the further poses", 0)
+            advance("waiting for `rigcal gap` again, with the additional poses", 0)
             name = "gap-again"
             found.append(_find_gap(out, rig, name, training, checks, seed))
     finally:
@@ -117,7 +116,7 @@ def play(out: Path, rate: float, seed: int, advance: Advance) -> dict[str, Any]:
 
 
 def _timed_as(truth: Truth, store: Path) -> Truth:
-    """Count the instants of the truth as the store's observations do, and not from simulated second 0."""
+    """Shift the times of the truth from simulated second 0 to the time axis of the store's observations."""
     if "time_s" not in truth.coefficients:
         return truth
     with Reader(store) as reader:
@@ -130,10 +129,11 @@ def _timed_as(truth: Truth, store: Path) -> Truth:
 
 
 def outcome(gap: Mapping[str, Any], truth: Truth) -> Outcome:
-    """Compare an answer of the workflow, as `rigcal gap --json` gives it, with the truth.
+    """Compare an answer of the workflow, as from `rigcal gap --json`, with the truth.
 
-    `right` names it and nothing else; `set` has it among those that the data cannot tell apart, and named nothing that
-    is not there.
+    Returns:
+        `right` if only the hidden effect is named, `set` if it is in the indistinguishable set and no wrong effect is
+        named, else `missed`.
     """
     effects = {(effect["family"], effect["where"]) for effect in gap["effects"]}
     pending = {(one["family"], one["where"]) for one in gap["indistinguishable"]}
@@ -146,11 +146,11 @@ def outcome(gap: Mapping[str, Any], truth: Truth) -> Outcome:
 
 
 def show(result: Mapping[str, Any]) -> None:
-    """Print the truth beside the verdict."""
+    """Print the verdict and the truth."""
     gap, truth = result["gap"], result["truth"]
     echo(_verdict(gap), bold=True)
     if gap["description"]:
-        echo(f"On what it depends: {gap['description']}")
+        echo(f"Dependence: {gap['description']}")
     rows = []
     own = next((e for e in gap["effects"] if (e["family"], e["where"]) == (truth["family"], truth["where"])), None)
     for name, value in truth["coefficients"].items():
@@ -182,7 +182,7 @@ def _verdict(gap: Mapping[str, Any]) -> str:
         return f"The verdict: one of {_set_of(gap)}."
     return "The verdict: " + {
         "none": "simulation and measurement agree within the noise.",
-        "unidentified": "something is missing that no effect of the library explains.",
+        "unidentified": "there is an error that no effect of the library explains.",
     }.get(gap["verdict"], str(gap["verdict"]))
 
 
@@ -198,9 +198,9 @@ def _proposed(gap: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 
 def rounds(rows: Sequence[Mapping[str, Any]]) -> list[tuple[float, list[dict[str, Any]]]]:
-    """Rows of a plan by the round that they are measured in, each with the pause before it, simulated seconds.
+    """Return the rounds of a plan, each as the pause before it in simulated seconds and its rows.
 
-    Rounds are as far apart as the rows say, or as a demonstration can wait for.
+    Rounds are as far apart as the rows require; long plans are compressed to `LONGEST_S`.
     """
     by_time: dict[float, list[dict[str, Any]]] = {}
     for row in rows:
@@ -212,17 +212,17 @@ def rounds(rows: Sequence[Mapping[str, Any]]) -> list[tuple[float, list[dict[str
 
 
 def concessions(rig: Rig, rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Sentences on the conditions in a plan's rows that the simulated boom cannot bring about."""
+    """Return sentences on the conditions in a plan's rows that the simulated boom cannot fulfil."""
     times = [float(row["time_s"]) for row in rows if "time_s" in row]
     out = []
     if times and max(times) - min(times) > LONGEST_S:
         asked_h = (max(times) - min(times)) / 3600.0
-        out.append(f"The plan asks for rounds over {asked_h:.0f} h; here they are over {LONGEST_S / 60.0:.0f} min.")
+        out.append(f"The plan's rounds span {asked_h:.0f} h; here they span {LONGEST_S / 60.0:.0f} min.")
     done = {"pose", "prisms", "fixes", "time_s", "dwell_s", *(joint.column for joint in rig.joints)}
     done |= {f"{name}_dir" for name in rig.joint_names}
     left = sorted({name for row in rows for name in row} - done)
     if left:
-        out.append(f"What the simulated boom cannot do, and leaves: {', '.join(left)}.")
+        out.append(f"Conditions that the simulated boom cannot fulfil and ignores: {', '.join(left)}.")
     return out
 
 

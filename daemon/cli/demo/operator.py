@@ -1,4 +1,4 @@
-"""A simulated operator: starts the daemon on a simulated rig and holds sessions with the usual commands."""
+"""A simulated operator: starts the daemon with a simulated rig and holds sessions with the usual commands."""
 
 from __future__ import annotations
 
@@ -17,31 +17,31 @@ RIG = "swdt82"
 _OTHER_SETTINGS = """poll_interval_s = 0.25
 
 [sessions]
-settle_s = 2.0  # simulated time runs fast: the computer's own delays are this much longer in it
+settle_s = 2.0  # simulated time runs fast, so delays of the computer are longer in it
 """
 PRISMS = ("r", "s", "b", "w")
 CONTROL_POINTS = ("cp1", "cp2")
 DWELL_S = 3.5
 DEADLINE_S = 600.0
-STUCK_S = 30.0  # without a new pose
+STUCK_S = 30.0  # without a new pose, until the progress mentions it
 
 Advance = Callable[[str, int], None]
-"""Receives a sentence on the progress, and the number of steps done since."""
+"""Called with a sentence on the progress and the number of steps done since the last call."""
 
 
 class DemoError(Exception):
-    """The demonstration did not come to its end; the message says where it stopped."""
+    """The demonstration did not finish; the message says where it stopped."""
 
 
 class Operator:
-    """Talks to the demonstration's daemon as an operator would, with the same commands.
+    """Controls the demonstration's daemon with the commands that an operator would use.
 
     Args:
-        directory: where configuration, store, models and report go.
+        directory: for configuration, store, models and report.
         rate: simulated seconds per second.
         seed: of the simulated machine.
-        options: further ones of `rigcal run --sim`.
-        settings: further lines of the configuration.
+        options: additional options of `rigcal run --sim`.
+        settings: additional lines of the configuration.
     """
 
     def __init__(
@@ -64,7 +64,12 @@ class Operator:
         return request(self._socket, command, arguments)
 
     def wait(self, what: str, done: Callable[[], bool], *, simulated_s: float = 0.0) -> None:
-        """Wait until `done`, looking five times a second; `simulated_s` is what the plan itself waits for.
+        """Wait until `done` returns True, which is checked five times a second.
+
+        Args:
+            what: what is waited for, for the error message.
+            done: the condition.
+            simulated_s: additional simulated time that the plan itself takes.
 
         Raises:
             DemoError: the daemon ended, or it took too long.
@@ -79,19 +84,17 @@ class Operator:
             time.sleep(0.2)
 
     def _why(self) -> str:
-        """Return a clause on why it takes so long, where that is known."""
+        """Return a clause on why it takes so long, "" if unknown."""
         busy = overload()
-        return (
-            f": {busy}, too few for --rate {self._rate:g}; a lower one takes longer and comes through" if busy else ""
-        )
+        return f": {busy}, which is too much for --rate {self._rate:g}; use a lower rate" if busy else ""
 
     def pause(self, simulated_s: float) -> None:
-        """Let simulated time pass with no session open; the boom goes on moving."""
+        """Let simulated time pass without an open session; the boom keeps moving."""
         over = time.monotonic() + simulated_s / self._rate
         self.wait("the next round", lambda: time.monotonic() >= over, simulated_s=simulated_s)
 
     def begin(self) -> None:
-        """Wait for the first fix, and set the station up."""
+        """Wait for the first fix, then record the station's set-up."""
         self.wait("the first fix", self._is_ready)
         self.say("setup.new", id="demo", instrument="simulated Topcon GTS-800A", tilt_arcsec=3.0, ppm=0.0)
 
@@ -101,11 +104,11 @@ class Operator:
         """Hold one session: control points first and last, poses in between.
 
         Args:
-            prism: which the station is aimed at.
+            prism: the prism that the station is aimed at.
             kind: of the session.
-            poses: how many at least.
-            advance: told of each.
-            planned: rows of a pose plan that the boom is driven to; the session lasts until it has been at all.
+            poses: least number of poses.
+            advance: called for each pose.
+            planned: rows of a pose plan that the boom is driven to; the session lasts until all were visited.
 
         Returns:
             The session's name.
@@ -118,10 +121,10 @@ class Operator:
         def recorded() -> int:
             return int(self.say("session.show", id=name)["poses"]) - early
 
-        early = recorded()  # a busy computer may be slow to shoot the control points: those poses lie before them
+        early = recorded()  # poses from before the control points, if a busy computer was slow to shoot these
 
         if planned:
-            # Back from the control points, the station's first fixes count only once they are known to be of the prism.
+            # After the control points, fixes count only once they are known to be of the prism.
             self.wait(f"a pose of prism {prism}", lambda: recorded() > 0)
             self.say("simulation.visit", poses=list(planned))
 
@@ -133,7 +136,7 @@ class Operator:
                 advance(text, now - seen)
                 seen, moved_at = now, time.monotonic()
             elif time.monotonic() - moved_at > STUCK_S:
-                advance(f"{text}, none for a while{self._why()}", 0)
+                advance(f"{text}, no new pose for a while{self._why()}", 0)
             return now >= poses and not (planned and self.say("simulation.visit")["left"])
 
         stands_s = sum(float(row.get("dwell_s", 0.0)) for row in planned)

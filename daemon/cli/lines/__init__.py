@@ -1,1 +1,1 @@
-"""The daemon's state, jobs, clock and rig in lines for people."""
+"""Text for people about the daemon's state, jobs, clock and rig."""

@@ -1,4 +1,4 @@
-"""The computer's clock, in lines for people."""
+"""Text for people about the computer's clock."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ _UNITS = ((1.0, "s", 1.0), (1e-3, "ms", 1e3), (0.0, "us", 1e6))
 
 
 def clock_sentence(state: Mapping[str, Any]) -> str:
-    """Return the state of the computer's clock, a clause."""
+    """Return the state of the computer's clock as a clause."""
     if state["is_synchronized"] is None:
-        return f"it is not known whether it is synchronised ({state['error']})"
+        return f"unknown whether it is synchronised ({state['error']})"
     if not state["is_synchronized"]:
         return "not synchronised with other clocks"
     text = f"synchronised ({state['source']})"
@@ -23,7 +23,7 @@ def clock_sentence(state: Mapping[str, Any]) -> str:
 
 
 def session_clock_lines(session: Mapping[str, Any]) -> Iterator[str]:
-    """Return how the computer's clock was at a session's start and end, once where that is the same."""
+    """Yield the state of the computer's clock at a session's start and end, in one line if both are the same."""
     told = {phase: clock_sentence(state) for phase, state in session["clock"].items() if state is not None}
     if len(told) > 1 and len({*told.values()}) == 1:
         yield f"the computer's clock at its start and end: {told['start']}"
@@ -33,12 +33,12 @@ def session_clock_lines(session: Mapping[str, Any]) -> Iterator[str]:
 
 
 def latency_sentence(latency: Mapping[str, Any]) -> str:
-    """Return the latency of a session's fixes against its joints, a clause."""
+    """Return the latency of a session's fixes relative to its joint readings, as a clause."""
     if "reason" in latency:
-        return f"not known: {latency['reason']}"
+        return f"unknown: {latency['reason']}"
     milliseconds, sigma = latency["seconds"] * 1e3, latency["standard_error_s"] * 1e3
     basis = f"{latency['fixes']} fixes of {latency['motions']} motions"
-    return f"{milliseconds:.0f} ms, give or take {max(sigma, 1.0):.0f} ms, beyond link_delay_s (from {basis})"
+    return f"{milliseconds:.0f} ms +- {max(sigma, 1.0):.0f} ms in addition to link_delay_s (from {basis})"
 
 
 def _size(seconds: float) -> str:

@@ -1,4 +1,4 @@
-"""A job in words: what it came to, how far it is, how long it took."""
+"""Text for people about jobs: state, progress, duration, result."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ _COLOURS = {"done": "green", "failed": "red", "interrupted": "yellow", "cancelle
 
 
 def job_line(job: Mapping[str, Any]) -> str:
-    """Return a job's state in one line, with its progress, its error or its result."""
+    """Return a job's state in one line, with its progress, error or result."""
     name = f"job {job['id']} {job['kind']}" + (f" of {job['session_id']}" if job.get("session_id") else "")
     told = outcome(job)
     return f"{name}: {job['state']}" + (f", {told}" if told else "")
 
 
 def outcome(job: Mapping[str, Any]) -> str:
-    """Return what a job came to: why it failed, the error on held-out fixes, or how far it is."""
+    """Return the progress, error or result of a job."""
     if job["state"] == "running":
         return f"{percent(job['progress'])}: {job['message'] or 'starting'}"
     if job["error"]:
@@ -31,16 +31,16 @@ def outcome(job: Mapping[str, Any]) -> str:
 
 
 def report_of(job: Mapping[str, Any]) -> str | None:
-    """Return the path of a job's report; None without one."""
+    """Return the path of a job's report; None if it has none."""
     return (job.get("result") or {}).get("report")
 
 
 def show_jobs(jobs: Sequence[Mapping[str, Any]], without: Sequence[Mapping[str, Any]] = ()) -> None:
-    """Print jobs with their results, and why sessions have none.
+    """Print jobs with their results, and the reasons why sessions have no job.
 
     Args:
         jobs: oldest first.
-        without: sessions that started none, each with the reason as `no_job`.
+        without: sessions without a job, each with the reason under `no_job`.
     """
     if jobs:
         echo_table(("job", "kind", "session", "state", "took", "result"), _rows(jobs))
@@ -98,6 +98,6 @@ def _drift(result: Mapping[str, Any]) -> str:
     told = []
     for check in checks:
         ratio = check["ratio"]
-        what = check["reason"] if ratio is None else f"errors are {number(ratio, 2)} times the predicted"
+        what = check["reason"] if ratio is None else f"errors are {number(ratio, 2)} times the predicted ones"
         told.append(f"{check['session']}: {what}")
-    return "; ".join(told) or "no check session to hold the live model against"
+    return "; ".join(told) or "no check session to compare with the live model"

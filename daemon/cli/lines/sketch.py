@@ -1,4 +1,4 @@
-"""A rig's chain as a few lines of text, from the side and from above, for terminals."""
+"""Draws a rig's chain as lines of text, from the side and from above, for terminals."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ _ASPECT = 2.0  # a character is twice as high as wide
 def sketch(bodies: Bodies, across: Sequence[int]) -> list[str]:
     """Draw a rig's pose on a grid of characters.
 
-    Links are dots, frames the last digit of their row's number (those of links that have a length), prisms `*`, the
-    base `#`.
+    Links are dots, frames at the end of a link with a length are the last digit of their row number, prisms are `*`,
+    and the base is `#`.
 
     Args:
         bodies: the rig in one pose.
-        across: axes of the base frame that go to the right and up, such as (0, 2).
+        across: axes of the base frame that point to the right and up, such as (0, 2).
     """
     u, v = across
     points = bodies.everything_mm[0][:, (u, v)]

@@ -1,4 +1,4 @@
-"""The daemon's state in lines for people: alarms, gaps, stations, sessions, jobs and models."""
+"""Text for people about the daemon's state: alarms, gaps, stations, sessions, jobs and models."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _ALARMS_OLD_S = 30.0  # they are evaluated every second
 def show_alarms(alarms: Mapping[str, Any]) -> None:
     """Print the active alarms, each with its remedy."""
     if alarms["looked_age_s"] > _ALARMS_OLD_S:
-        echo(f"alarms were last looked at {duration(alarms['looked_age_s'])} ago: the daemon is held up")
+        echo(f"alarms were last evaluated {duration(alarms['looked_age_s'])} ago: the daemon is blocked")
     for alarm in alarms["active"]:
         is_critical = alarm["severity"] == "critical"
         echo(alarm_line(alarm), fg="red" if is_critical else "yellow", bold=is_critical)
@@ -38,30 +38,30 @@ def alarm_line(alarm: Mapping[str, Any]) -> str:
 
 
 def cleared_line(alarm: Mapping[str, Any]) -> str:
-    """Return an alarm that is over, with its beginning and end."""
+    """Return a cleared alarm with the times when it was raised and cleared."""
     lasted = f"{utc(alarm['since_utc_ns'])} to {utc(alarm['cleared_utc_ns'])}"
     return f"{lasted} {alarm['severity']} {alarm['kind']} {alarm['subject']}: {alarm['text']}"
 
 
 def notice_lines(notices: Sequence[Mapping[str, Any]]) -> Iterator[str]:
-    """Return the ways by which notices of alarms are not delivered, with how many wait."""
+    """Yield a line for each target to which notices cannot be delivered, with the number of pending notices."""
     for one in notices:
         if one["error"] is not None:
-            yield f"notices by {one['target']}: {one['waiting']} wait, the last delivery failed: {one['error']}"
+            yield f"notices by {one['target']}: {one['waiting']} pending, the last delivery failed: {one['error']}"
 
 
 def store_lines(status: Mapping[str, Any]) -> Iterator[str]:
-    """Return the store's present work and its unreadable parts; its faults are alarms."""
+    """Yield lines on the store's current work and its unreadable parts; its faults are alarms."""
     if status["store_health"]["state"] == "checking":
         yield status["store_health"]["text"]
     if status["acquisition"]["is_behind"]:
-        yield "captures wait to be decoded: readings and fixes come late, and jobs wait"
+        yield "captures are waiting to be decoded: readings and fixes are late, and jobs wait"
     for part, reason in status["unreadable"].items():
         yield f"{part}: cannot be read from the store ({reason})"
 
 
 def gap_state_lines(acquisition: Mapping[str, Any]) -> Iterator[str]:
-    """Return the open gaps, one line for all channels of a link that lack data for one reason."""
+    """Yield the open gaps, with one line for all channels of a link that have the same reason."""
     links = {channel["name"]: channel["link"] for channel in acquisition["channels"]}
     groups: dict[tuple[str, str], list[Mapping[str, Any]]] = {}
     for gap in acquisition["gaps"]:
@@ -74,12 +74,12 @@ def gap_state_lines(acquisition: Mapping[str, Any]) -> Iterator[str]:
 
 
 def station_line(station: Mapping[str, Any]) -> str:
-    """Return a station's present state."""
+    """Return a station's current state."""
     return f"station {station['name']}: {station['sentence']}; {station['fixes']} fixes"
 
 
 def decoding_lines(decoding: Sequence[Mapping[str, Any]]) -> Iterator[str]:
-    """Return how many captures of each device could not be decoded, with the most frequent reason."""
+    """Yield the number of captures of each device that could not be decoded, with the most frequent reason."""
     for device in decoding:
         count, mostly = device["count"], device["reason_count"]
         why = device["reason"] if mostly == count else f"{mostly} of them: {device['reason']}"
@@ -91,7 +91,7 @@ def decoding_lines(decoding: Sequence[Mapping[str, Any]]) -> Iterator[str]:
 
 
 def show_session(session: Mapping[str, Any]) -> None:
-    """Print a session: counts, exclusions, control points, and why calibration would not use it."""
+    """Print a session: counts, exclusions, control points, and why calibration does not use it."""
     echo(
         f"session {session['id']} ({session['kind']}, prism {session['prism']}, set-up {session['setup']}) is "
         f"{session['state']}: {session['poses']} poses, {session['observations']} observations"
@@ -99,20 +99,20 @@ def show_session(session: Mapping[str, Any]) -> None:
     for reason, n in session["excluded"].items():
         echo(f"  {n} excluded: {reason}")
     for suspicion in session.get("prism_suspicions", ()):
-        what = f"{suspicion['text']}; its fixes do not count: {suspicion['remedy']}"
+        what = f"{suspicion['text']}; these fixes are not used: {suspicion['remedy']}"
         echo(f"  since {utc(suspicion['since_utc_ns'])} {what}", fg="red")
     for shot in session["control_shots"]:
         size = "defined" if shot["misclosure_mm"] is None else f"misclosure {shot['misclosure_mm']:.1f} mm"
         echo(f"  control point {shot['point']} at the {shot['phase']}: {size}")
     if session["state"] == "open" and not session["control_shots"]:
-        echo("  no control point has been shot yet: `rigcal session shoot NAME`, now and again before the end")
+        echo("  no control point has been shot yet: `rigcal session shoot NAME`, now and once more before the end")
     for line in session_clock_lines(session):
         echo(f"  {line}")
     for step in session["clock_steps"]:
         back = "back" if step["step_s"] < 0 else "forward"
         echo(f"  {utc(step['at_utc_ns'])}: the computer's clock was set {back} by {abs(step['step_s']):.1f} s")
     if session["setup_moved"]:
-        echo("  the station has moved since this set-up was described", fg="red")
+        echo("  the station has moved since this set-up was recorded", fg="red")
     if session["not_used"] is not None:
         why = f"{session['not_used']}; to use it anyway: `rigcal session accept {session['id']}`"
         echo(f"  calibration does not use this session: {why}", fg="red")
@@ -135,12 +135,12 @@ def model_lines(models: Mapping[str, Any]) -> list[str]:
             lines.append(f"{start}: {candidate['comparison']['sentence']}")
             lines.append(f"  `rigcal model accept {candidate['id']}` makes it the live one")
         else:
-            lines.append(f"{start}, and would be refused now: {candidate['refused_because']}")
+            lines.append(f"{start} but would be refused now: {candidate['refused_because']}")
     return lines
 
 
 def gap_lines(gap: Mapping[str, Any]) -> Iterator[str]:
-    """Return the newest verdict on the model's gap with the next measurements, and the live model's drift."""
+    """Yield the newest verdict on the model's gap with the next measurements, and the live model's drift."""
     found, failed, drift = gap["verdict"], gap["failed"], gap["drift"]
     if failed is not None:
         yield f"gap: the job of session {failed['session']} failed (job {failed['job']}): {failed['error']}"
@@ -160,12 +160,12 @@ def _drift_line(drift: Mapping[str, Any]) -> str:
     if drift["ratio"] is None:
         last = f"the last, {drift['newest']}, could not be used: {drift['reason']}"
     else:
-        last = f"in the last, {drift['newest']}, errors are {number(drift['ratio'], 2)} times the predicted"
+        last = f"in the last, {drift['newest']}, errors are {number(drift['ratio'], 2)} times the predicted ones"
     sums = f"sums {number(drift['upper'], 2)} and {number(drift['lower'], 2)} of {number(drift['decision'], 2)}"
     checks = f"{drift['checks']} check session{'s' if drift['checks'] != 1 else ''}"
     verdict = {
         "none": "none",
-        "worse": f"the machine has left the model (since check session {drift['drifted_with']})",
-        "better": "none; the machine is truer than the model says, which a new calibration would show",
+        "worse": f"the machine has drifted from the model (since check session {drift['drifted_with']})",
+        "better": "none; errors are smaller than the model predicts, which a new calibration would correct",
     }[drift["alarm"]]
     return f"{start}: {verdict}; {checks}, {last} ({sums})"

@@ -1,7 +1,7 @@
 """The daemon's state on one screen: what it does, what is wrong, and what to do next.
 
-Alarms get the room first, then open gaps; lists that may be long are bounded. What is left out is counted, with the
-command that shows it.
+Alarms have priority, then open gaps. Long lists are shortened; a line counts the omitted entries and names the command
+that shows them.
 """
 
 from __future__ import annotations
@@ -16,30 +16,30 @@ from daemon.host.safe_output import duration, shown
 from daemon.next_step import next_line
 from daemon.report.words import number
 
-LINES = 23  # one of a terminal's 24 is the prompt's
+LINES = 23  # of a terminal's 24 lines, one is for the prompt
 NARROWEST = 60
 _LABEL = 10  # characters
 _NAMES_SHOWN = 6
 _REASONS_SHOWN = 2
-_DEVICES_SHOWN = 2  # of those with failed decodes
+_DEVICES_SHOWN = 2  # with decoding failures
 _JOBS_SHOWN = 3
-_GAPS_KEPT = 3  # they have room whatever the alarms take
+_GAPS_KEPT = 3  # shown even if there are many alarms
 _CELL = 22  # characters of a joint with its value
 _HELD_UP_S = 30.0
 
 
 class Line(NamedTuple):
-    """A line of the screen with its style, as `click.style` names it."""
+    """A line of the screen with its style options of `click.style`."""
 
     text: str
     style: Mapping[str, Any] = {}
 
 
 def state_sentence(status: Mapping[str, Any]) -> str:
-    """Say in one sentence what the rig is doing."""
+    """Return in one sentence what the rig is doing."""
     session, jobs, models = status["session"], status["jobs"], status["models"] or {}
     if status["alarms"]["looked_age_s"] > _HELD_UP_S:
-        return f"held up: the daemon last looked at its alarms {duration(status['alarms']['looked_age_s'])} ago"
+        return f"blocked: the daemon last evaluated its alarms {duration(status['alarms']['looked_age_s'])} ago"
     if session is not None:
         counted = f"{session['poses']} poses, {session['observations']} observations"
         return f"recording session {session['id']} ({session['kind']}, prism {session['prism']}): {counted}"
@@ -55,13 +55,13 @@ def state_sentence(status: Mapping[str, Any]) -> str:
 
 
 def summary(status: Mapping[str, Any], width: int, lines: int = LINES, *, with_joints: bool = False) -> list[Line]:
-    """Return the state on at most so many lines.
+    """Return the state in a limited number of lines.
 
     Args:
         status: the daemon's state.
         width: columns of the terminal.
-        lines: how many there may be; a state that is long may take more than very few.
-        with_joints: the joints' values, too.
+        lines: largest number of lines; may be exceeded if it is very small.
+        with_joints: whether to include the joints' values.
     """
     width = max(width, NARROWEST)
     version = f", rigcal {status['version']}" if "version" in status else ""
@@ -73,21 +73,21 @@ def summary(status: Mapping[str, Any], width: int, lines: int = LINES, *, with_j
     gaps = _entries("gaps", _gaps(status["acquisition"]), width)
     body = [entry for label, texts in _body(status) for entry in _entries(label, texts, width)]
     room = lines - len(head) - len(end)
-    kept = sum(map(len, gaps[:_GAPS_KEPT])) + 1  # and a line that counts what does not fit
+    kept = sum(map(len, gaps[:_GAPS_KEPT])) + 1  # and a line that counts the omitted lines
     alarms = _alarms(status["alarms"]["active"], width, room - kept)
-    told = _fitted([*gaps, *body], room - len(alarms), "... {} more lines: `rigcal status --all` has them", width)
+    told = _fitted([*gaps, *body], room - len(alarms), "... {} more lines: `rigcal status --all` shows them", width)
     return [*head, *alarms, *told, *end]
 
 
 def reading(channel: Mapping[str, Any]) -> str:
-    """Return the present value of a channel with its unit, or why there is none."""
+    """Return the current value of a channel with its unit, or the reason why there is none."""
     if channel["value"] is None:
         return str(channel["status"]).replace("_", " ")
     return f"{channel['value']:.3f} {channel['unit']}"
 
 
 def _joints(channels: Sequence[Mapping[str, Any]], width: int) -> list[Line]:
-    """Return the joints' values in columns that keep their places."""
+    """Return the joints' values in columns with fixed positions."""
     cells = [f"{c['name']} {reading(c)}" for c in channels if c["kind"] == "joint"]
     many = max((width - _LABEL) // _CELL, 1)
     rows = ["".join(f"{shown(cell):{_CELL}}" for cell in cells[i : i + many]) for i in range(0, len(cells), many)]
@@ -95,7 +95,7 @@ def _joints(channels: Sequence[Mapping[str, Any]], width: int) -> list[Line]:
 
 
 def _alarms(active: Sequence[Mapping[str, Any]], width: int, room: int) -> list[Line]:
-    """Return alarms with their remedies where there is room, those that count most first, and one in any case."""
+    """Return as many alarms with their remedies as fit, the most important first, but at least one."""
     if not active:
         return _labelled("alarms", ["none"], width)
     entries: list[list[Line]] = []
@@ -105,7 +105,7 @@ def _alarms(active: Sequence[Mapping[str, Any]], width: int, room: int) -> list[
         label = "" if entries else "alarms"
         remedy = _labelled("", [f"  {alarm['remedy']}"], width)
         entries.append(_labelled(label, [alarm_line(alarm)], width, **style) + remedy)
-    return _fitted(entries, max(room, len(entries[0]) + 1), "and {} more: `rigcal alarms` has all", width)
+    return _fitted(entries, max(room, len(entries[0]) + 1), "and {} more: `rigcal alarms` shows all", width)
 
 
 def _gaps(acquisition: Mapping[str, Any]) -> list[str]:
@@ -120,15 +120,15 @@ def _body(status: Mapping[str, Any]) -> Iterator[tuple[str, list[str]]]:
     yield "channels", [_channels(acquisition["channels"])]
     yield "station", [f"{s['name']}: {s['sentence']}; {s['fixes']} fixes" for s in acquisition["stations"]]
     yield "", [*store_lines(status), *notice_lines(status["notices"])]
-    yield "decoding", _first([*decoding_lines(failing)], _DEVICES_SHOWN, "`rigcal status --all` has all")
+    yield "decoding", _first([*decoding_lines(failing)], _DEVICES_SHOWN, "`rigcal status --all` shows all")
     if status["session"]:
         yield "session", list(_session(status["session"]))
-    yield "jobs", _first([job_line(job) for job in jobs], _JOBS_SHOWN, "`rigcal jobs list` has all")
+    yield "jobs", _first([job_line(job) for job in jobs], _JOBS_SHOWN, "`rigcal jobs list` shows all")
     yield "models", model_lines(models) if models else []
     if gap and gap["verdict"] is not None:
         yield "verdict", [f"{gap['verdict']['sentence']} (session {gap['verdict']['session']})"]
     if gap and gap["drift"] is not None and gap["drift"]["alarm"] == "worse":
-        yield "drift", [f"the machine has left model {gap['drift']['model']}"]
+        yield "drift", [f"the machine has drifted from model {gap['drift']['model']}"]
 
 
 def _links(links: Sequence[Mapping[str, Any]]) -> str:
@@ -156,7 +156,7 @@ def _channels(channels: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _first(lines: Sequence[str], most: int, where: str) -> list[str]:
-    """Return the first of some lines and how many more there are."""
+    """Return the first `most` lines and, if there are more, a line with their number."""
     more = [f"and {len(lines) - most} more: {where}"] if len(lines) > most else []
     return [*lines[:most], *more]
 
@@ -180,11 +180,11 @@ def _session(session: Mapping[str, Any]) -> Iterator[str]:
         more = f"; {rest} more reasons: `rigcal session show {session['id']}`" if rest > 0 else ""
         yield f"excluded: {', '.join(reasons[:_REASONS_SHOWN])}{more}"
     for suspicion in session.get("prism_suspicions", ()):
-        yield f"fixes do not count: {suspicion['text']}"
+        yield f"fixes are not used: {suspicion['text']}"
 
 
 def _fitted(entries: Sequence[list[Line]], room: int, more: str, width: int) -> list[Line]:
-    """Return as many whole entries as so many lines hold; the last line counts those that are left out."""
+    """Return as many whole entries as fit into `room` lines; the last line counts omitted entries."""
     told: list[Line] = []
     for place, entry in enumerate(entries):
         left = len(entries) - place

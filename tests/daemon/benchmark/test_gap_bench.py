@@ -77,8 +77,8 @@ def score(trials: list[Trial], what: str) -> Score:
     return next(s for s in scores(trials) if s.what == what)
 
 
-RIGHT = "named right at >= 1x, separable"
-SET = "truth inside a reported set that could not have been a name"
+RIGHT = "rightly named at >= 1x, separable"
+SET = "truth in a reported set where no name was possible"
 UNTOLD = {"separable": False, "plain": False}
 
 
@@ -102,7 +102,7 @@ def test_the_right_family_at_another_joint_is_right_but_out_of_place() -> None:
     trials = [judged(label("single", "backlash"), named("backlash", where="theta3"))]
 
     assert score(trials, RIGHT).value == 1.0
-    assert score(trials, "  at the right place too").value == 0.0
+    assert score(trials, "  also at the right place").value == 0.0
 
 
 def test_what_nobody_could_tell_apart_does_not_count_as_separable() -> None:
@@ -110,7 +110,7 @@ def test_what_nobody_could_tell_apart_does_not_count_as_separable() -> None:
 
     assert score(trials, RIGHT).n == 0
     assert score(trials, RIGHT).met is None
-    assert score(trials, "  of all, separable or not").value == 0.0
+    assert score(trials, "  of all cases, separable or not").value == 0.0
     assert score(trials, SET).value == 1.0
 
 
@@ -119,7 +119,7 @@ def test_a_set_is_no_miss_where_a_draw_in_fifty_leaves_nothing_else() -> None:
 
     assert score(trials, RIGHT).value == 0.0
     assert score(trials, SET).value == 1.0
-    assert score(trials, "  the same of what is not separable").value == 0.0
+    assert score(trials, "  truth in a set of an inseparable effect").value == 0.0
 
 
 @pytest.mark.parametrize(
@@ -225,7 +225,7 @@ def test_beside_an_effect_outside_the_library_it_is_right_to_name_the_one_inside
     told = (named("backlash"), named("backlash", "latency"), silent("unidentified"), named("latency"))
     trials = [judged(of, answer) for answer in told]
 
-    assert score(trials, "beside an effect outside the library: named right").value == 0.25
+    assert score(trials, "with an effect outside the library: rightly named").value == 0.25
     assert score(trials, "  misnamed").value == 0.5
 
 
@@ -233,8 +233,8 @@ def test_a_more_general_family_is_no_misnaming_where_the_particular_one_is_left_
     of = label("left_out", "encoder_harmonic", general=["joint_error_map"])
     trials = [judged(of, told) for told in (named("joint_error_map"), named("angle_scale"), silent("unidentified"))]
 
-    assert score(trials, "one family left out, its data shown: misnamed").value == pytest.approx(1 / 3)
-    assert score(trials, "  or given the name of a more general family").value == pytest.approx(2 / 3)
+    assert score(trials, "a family left out of the library: misnamed").value == pytest.approx(1 / 3)
+    assert score(trials, "  misnamed or named as a more general family").value == pytest.approx(2 / 3)
 
 
 def test_a_case_that_failed_is_a_miss_and_is_counted() -> None:
@@ -359,7 +359,7 @@ def test_effects_of_a_machine_are_counted_one_by_one_with_their_places() -> None
         judged(of, silent("unidentified")),
     ]
 
-    assert score(trials, "machine: effects named with their place").value == pytest.approx(3 / 9)
+    assert score(trials, "machine: effects named at their place").value == pytest.approx(3 / 9)
     wrong = score(trials, "machine: wrong name or place among all named")
     assert (wrong.value, wrong.n) == (pytest.approx(1 / 5), 5)
 
@@ -398,8 +398,8 @@ def test_an_effect_in_a_part_of_the_data_is_named_with_the_part_and_its_border(
     trials = [judged(hidden_at("regime", "backlash@theta4", regime=PART), at("backlash@theta4", regime=told))]
 
     assert score(trials, "regime: effect, part and border named").value == border
-    assert score(trials, "  effect and part, whatever the border").value == part
-    assert score(trials, "  effect, whatever the part").value == 1.0
+    assert score(trials, "  effect and part, any border").value == part
+    assert score(trials, "  effect, any part").value == 1.0
     assert trials[0].is_right == (border == 1.0)
     assert score(trials, "regime: wrong name, place or part among all named").value == wrong
 
@@ -408,7 +408,7 @@ def test_no_name_may_come_of_noise_that_wanders_along_a_path() -> None:
     answers = (silent(), silent("unidentified"), named("backlash"), pending("backlash", "latency"))
     trials = [judged(label("path"), told) for told in answers]
 
-    found = score(trials, "no effect, noise wanders along a path: named, also in a set")
+    found = score(trials, "no effect, noise wandering along a path: named, also in a set")
 
     assert (found.value, found.met) == (0.5, False)
     assert score(trials, "  any alarm").value == 0.75

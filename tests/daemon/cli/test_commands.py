@@ -87,7 +87,7 @@ def test_an_empty_argument_is_refused_by_name(
     monkeypatch.chdir(tmp_path)
     refused = CliRunner().invoke(main, typed)
     assert refused.exit_code == 2
-    assert f"Error: {named} is empty; give it a value, or leave it out" in refused.stderr
+    assert f"Error: {named} is empty; give it a value or omit it" in refused.stderr
     assert not list(tmp_path.iterdir())
 
 

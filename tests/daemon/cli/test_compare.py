@@ -101,7 +101,7 @@ def test_the_protocol_prints_its_tables_and_draws_its_plots(torso: list[object],
 def test_wrong_use_is_refused_in_a_sentence(torso: list[object], tmp_path: Path) -> None:
     result = run("compare", *torso, "--protocol", "zhou2022", "--refit-base")
     assert result.exit_code == 2
-    assert "leave --refit-base out" in result.stderr
+    assert "omit --refit-base" in result.stderr
     test = tmp_path / "test.csv"
     test.write_text(test.read_text(encoding="utf-8").replace("east", "west"), encoding="utf-8")
     for protocol in ([], ["--protocol", "zhou2022"]):

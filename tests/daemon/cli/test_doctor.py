@@ -84,7 +84,7 @@ def test_the_port_of_an_slcan_adapter_is_looked_at_as_that_of_a_station(tmp_path
     assert findings["boom"]["remedy"] == "plug it in, or correct [[can]] channel"
     port.touch()
     _, findings = examine("--config", str(config))
-    assert f"{port} is no serial port" in findings["boom"]["text"]
+    assert f"{port} is not a serial port" in findings["boom"]["text"]
     port.unlink()
     controller, device = os.openpty()
     port.symlink_to(os.ttyname(device))
@@ -107,7 +107,7 @@ def test_backups_go_where_the_daemon_may_write(tmp_path: Path) -> None:
     assert examine("--config", str(config))[1]["backups"]["state"] == "good"
     if os.geteuid() == 0:
         os.chown(place, 65534, -1)
-        assert "is not of the user" in examine("--config", str(config))[1]["backups"]["text"]
+        assert "does not belong to the owner" in examine("--config", str(config))[1]["backups"]["text"]
 
 
 def test_a_wrong_configuration_is_the_first_finding(tmp_path: Path) -> None:
@@ -126,7 +126,7 @@ def test_a_busy_computer_is_told_beside_what_looks_silent(tmp_path: Path, monkey
     monkeypatch.setattr(os, "getloadavg", lambda: (1e3, 0.0, 0.0))
     _, findings = examine("--socket", str(tmp_path / "none"))
     assert findings["processor"]["state"] == "warning"
-    assert "1000 processes want to run on" in findings["processor"]["text"]
+    assert "1000 processes compete for" in findings["processor"]["text"]
     assert "--rate" in findings["processor"]["remedy"]
     monkeypatch.setattr(os, "getloadavg", lambda: (0.0, 0.0, 0.0))
     assert examine("--socket", str(tmp_path / "none"))[1]["processor"]["state"] == "good"
@@ -155,5 +155,5 @@ def test_a_channel_that_falls_silent_again_and_again_may_have_too_short_a_time_o
         },
     }
     findings = {finding.subject: finding for finding in daemon_state(status, "0.2.0")}
-    assert "timeout_s" in findings["time-out of theta1"].remedy
+    assert "timeout_s" in findings["timeout of theta1"].remedy
     assert findings["daemon"].remedy == "`systemctl restart rigcal`"

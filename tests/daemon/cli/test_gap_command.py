@@ -106,7 +106,7 @@ def test_a_directory_with_other_things_is_left_alone(directory: Path, tmp_path: 
     (tmp_path / "notes.txt").write_text("mine", "utf-8")
     result = run("gap", "--rig", "swdt82", "--data", directory / "session.csv", "--out", tmp_path)
     assert result.exit_code == 2
-    assert "holds 'notes.txt', which is no part of a gap report" in result.stderr
+    assert "contains 'notes.txt', which is not part of a gap report" in result.stderr
     with pytest.raises(ModelError, match="is a file"):
         check_gap_target(tmp_path / "notes.txt")
 
@@ -189,5 +189,5 @@ def test_one_effect_is_told_in_full_and_a_misspelt_one_refused() -> None:
         assert words in told.stdout
     refused = run("effects", "backslash")
     assert refused.exit_code == 2
-    assert "'backslash' is unknown; there are angle_scale" in refused.stderr
+    assert "'backslash' is unknown; known: angle_scale" in refused.stderr
     assert "angle_scale" in run("effects").stdout

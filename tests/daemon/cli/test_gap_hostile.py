@@ -112,7 +112,7 @@ def test_a_place_where_nothing_can_be_written_is_refused_before_any_work(tmp_pat
         out = tmp_path / "notes.txt" / "out"
         result = CliRunner().invoke(rigcal, [command, "--rig", "swdt82", "--data", str(data), "--out", str(out)])
         assert result.exit_code == 2
-        assert "notes.txt is a file; name another directory" in " ".join(result.stderr.split())
+        assert "notes.txt is a file; name a different directory" in " ".join(result.stderr.split())
 
 
 @pytest.mark.long

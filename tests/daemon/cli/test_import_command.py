@@ -70,7 +70,7 @@ def test_joint_values_at_one_time_are_refused_where_they_differ(
     joints, key = tmp_path / "joints.csv", "time" if "T" in times[0] else "time_s"
     joints.write_text(f"{key},{','.join(JOINTS)}\n{times[0]},0,0,0,0,0,0\n\n{times[1]},{values}\n")
     if values.endswith("5"):
-        said = f"joints.csv, line 4, column {key}: time {times[1]!r} is in line 2 with other joint values; leave one"
+        said = f"joints.csv, line 4, column {key}: time {times[1]!r} is in line 2 with different joint values; keep one"
         with pytest.raises(DescriptionError, match=re.escape(said)):
             read_joints(joints, RIG)
     else:
@@ -86,7 +86,7 @@ def joined_by_time(folder: Path, column: str, at: str, joint_times: list[object]
 
 
 ZONED, BARE = ["2026-11-24T10:00:00Z"], ["2026-11-24T10:00:00"]
-NO_ZONE = "have no time zone, and are taken for UTC"
+NO_ZONE = "have no time zone and are taken as UTC"
 
 
 @pytest.mark.parametrize(
@@ -110,8 +110,8 @@ def test_times_without_a_zone_are_taken_for_utc_and_that_is_said_once(
 @pytest.mark.parametrize(
     ("at", "joint_times", "said"),
     [
-        (BARE[0], ZONED, "walk.csv, line 2: times of joints.csv have a time zone, and those of walk.csv none"),
-        (ZONED[0], BARE, "walk.csv, line 2: times of walk.csv have a time zone, and those of joints.csv none"),
+        (BARE[0], ZONED, "walk.csv, line 2: times of joints.csv have a time zone but times of walk.csv do not"),
+        (ZONED[0], BARE, "walk.csv, line 2: times of walk.csv have a time zone but times of joints.csv do not"),
         (ZONED[0], ZONED + BARE, "joints.csv, line 3, column time: '2026-11-24T10:00:00': some times have a time zone"),
     ],
 )
@@ -127,14 +127,15 @@ def test_joints_of_a_spreadsheet_in_another_language_are_refused(tmp_path: Path)
     survey.write_text(SURVEY)
     joints.write_text(f"pose;{';'.join(JOINTS)}\n1;0,5;0;0;0;0;0\n")
     done = run(survey, "--rig", "ur10", "--joints", joints, "--out", tmp_path / "out.csv")
-    assert (done.exit_code, "line 1: one column only: separate columns by commas" in done.stderr) == (2, True)
+    assert (done.exit_code, "line 1: has only one column: separate columns with commas" in done.stderr) == (2, True)
 
 
 def test_a_point_that_is_there_twice_in_different_places_is_said(tmp_path: Path) -> None:
     survey, out = tmp_path / "survey.csv", tmp_path / "out.csv"
     survey.write_text(SURVEY + "2;110;214;313;tmac\n2;110;210;510;tmac\n")
     *_, note = told(survey, "--out", out)["notes"]
-    assert note == "survey.csv has points twice in different places: '2' in lines 3 and 5, 200 mm apart; both are taken"
+    where = "'2' in lines 3 and 5, 200 mm apart"
+    assert note == f"survey.csv has repeated points at different positions: {where}; all are used"
 
 
 @pytest.mark.parametrize(("setup", "names"), [("S1", ["S1-J/A/1.5", "S1-J/B/1.6"]), ("", ["J/A/1.5", "J/B/1.6"])])
@@ -144,8 +145,8 @@ def test_a_file_of_two_set_ups_gives_rows_of_two_set_ups_and_says_so(
     download, out = tmp_path / "two.gts", tmp_path / "out.csv"
     download.write_text(gts_download(POINTS[:2], ("_'J_(A_)1.5", "_'J_(B_)1.6")))
     *_, note = told(download, *(["--setup", setup] if setup else []), "--out", out)["notes"]
-    said = f"two.gts has 2 set-ups of the instrument, and so have the rows: {', '.join(names)}; "
-    assert note == f"{said}each has a frame of its own"
+    said = f"two.gts has 2 set-ups of the instrument, which the rows have too: {', '.join(names)}; "
+    assert note == f"{said}each has its own frame"
     rows = list(csv.DictReader(out.read_text(encoding="utf-8").splitlines()))
     assert [row["setup"] for row in rows] == [names[0], names[0], names[1], names[1]]
 
@@ -177,8 +178,8 @@ def test_an_instrument_that_is_set_up_again_under_the_same_name_is_said(tmp_path
     survey.write_text(text)
     found = told(survey, "--out", out)
     for notes in (found["notes"], told(survey, "--map", found["map_file"], "--out", tmp_path / "2.csv")["notes"]):
-        assert notes[-1].startswith(f"survey.txt sets the instrument up again under a name it had before: {again}; ")
-        assert notes[-1].endswith("give the file in parts if it stood elsewhere or was turned")
+        assert notes[-1].startswith(f"survey.txt sets the instrument up again under an earlier name: {again}; ")
+        assert notes[-1].endswith("split the file if the instrument was moved or turned")
 
 
 @pytest.mark.parametrize(("height", "is_said"), [("1.5", True), ("0", False), ("", False)])
@@ -187,7 +188,7 @@ def test_coordinates_of_places_below_the_prism_are_said(tmp_path: Path, height: 
     survey.write_text(f"point,x [m],y [m],z [m],Target Height\n1,1,2,3,{height}\n2,1,2,4,{height}\n")
     found = told(survey, "--out", tmp_path / "out.csv")
     for notes in (found["notes"], told(survey, "--map", found["map_file"], "--out", tmp_path / "2.csv")["notes"]):
-        said = "survey.csv has target heights of 1500 mm, so its coordinates may be of places as far below the prism"
+        said = "survey.csv has target heights of 1500 mm, so its coordinates may be of points that far below the prism"
         assert any(note.startswith(said) for note in notes) == is_said
 
 
@@ -202,7 +203,7 @@ def test_a_table_of_two_stations_has_two_set_ups_though_one_is_given_for_all(tmp
     survey, out = tmp_path / "survey.csv", tmp_path / "out.csv"
     survey.write_text("Setup;Point;X [m];Y [m];Z [m]\nS1;1;1;2;0\nS1;2;2;2;0\nS2;1;-3;2;0\nS2;2;-3;1;0\n")
     *_, note = told(survey, "--setup", "ALL", "--out", out)["notes"]
-    assert note.startswith("survey.csv has 2 set-ups of the instrument, and so have the rows: ALL-S1, ALL-S2; ")
+    assert note.startswith("survey.csv has 2 set-ups of the instrument, which the rows have too: ALL-S1, ALL-S2; ")
     rows = list(csv.DictReader(out.read_text(encoding="utf-8").splitlines()))
     assert [row["setup"] for row in rows] == ["ALL-S1", "ALL-S1", "ALL-S2", "ALL-S2"]
 
@@ -217,7 +218,7 @@ def test_a_prism_that_one_station_measured_with_two_prism_constants_is_said(tmp_
     for notes in (found["notes"], told(survey, "--map", found["map_file"], "--out", tmp_path / "2.csv")["notes"]):
         said = "survey.csv has prism 'w' at 'B' measured with prism constants of 0 mm (from point '2', line 3) and -30"
         assert sum("prism constants of" in note for note in notes) == 1
-        assert notes[-1].startswith(f"{said} mm (from point '3', line 4), by which its distances differ: ")
+        assert notes[-1].startswith(f"{said} mm (from point '3', line 4), so its distances are inconsistent: ")
 
 
 @pytest.mark.parametrize(("prism", "is_said"), [(None, False), ("w", True)])
@@ -250,7 +251,7 @@ def test_joints_are_matched_by_time(tmp_path: Path) -> None:
     joints = joints_csv(tmp_path / "joints.csv", "time_s", [0.0, 0.04])
     refused = run(survey, "--rig", "ur10", "--joints", joints, "--out", out)
     assert refused.exit_code == 2
-    assert "walk.csv, line 6: point '1' has 'rig:tip', which is no prism" in refused.stderr
+    assert "walk.csv, line 6: point '1' has 'rig:tip', which is not a prism" in refused.stderr
     mapped = told(survey, "--out", out)
     map_path = Path(mapped["map_file"])
     map_path.write_text(map_path.read_text() + '\n[prisms]\n"rig:tip" = "tmac"\n"rig:base" = "tmac"\n')
@@ -284,7 +285,7 @@ def test_points_without_names_have_no_joint_values_by_pose(tmp_path: Path, text:
     survey, joints = tmp_path / "survey.csv", joints_csv(tmp_path / "joints.csv", "pose", [1])
     survey.write_text(text)
     given = ("--rig", "ur10", "--prism", "tmac", "--joints", joints, "--out", tmp_path / "out.csv")
-    assert "survey.csv, line 2: the point has no name of its own, and joints.csv matches" in run(survey, *given).stderr
+    assert "survey.csv, line 2: the point has no name, but joints.csv has" in run(survey, *given).stderr
     survey.write_text(text.replace("Nummer", "PktNr").replace("\n;", "\n1;"))
     assert told(survey, *given)["points"] == 1
 
@@ -294,7 +295,7 @@ def test_points_without_names_have_no_joint_values_by_pose(tmp_path: Path, text:
     [
         (("q3_deg", "q9_deg"), "joints.csv, line 1, column q3_deg: the column is missing"),
         (("\n1,1,", "\n1,x,"), "joints.csv, line 3, column q1_deg: 'x' is not a number"),
-        (("\n1,1,", "\n2,1,"), "joints.csv, line 3, column pose: pose '2' is there twice"),
+        (("\n1,1,", "\n2,1,"), "joints.csv, line 3, column pose: pose '2' is repeated"),
         (("\n1,1,", "\n9,1,"), "survey.csv, line 2: joints.csv has no pose '001'"),
         (("pose,", "row,"), "joints.csv, line 1: needs a column 'pose'"),
     ],

@@ -102,7 +102,7 @@ def test_nodes_are_heard_on_a_bus_and_nothing_is_sent() -> None:
         assert heard.nodes == (32, 33)  # by its heartbeat, by its TPDO; what is sent to a node is no node
         assert set(heard.identifiers) == {0x720, 0x1A1, 0x80, 0x221}
         assert bus.recv(0) is None
-        with pytest.raises(ValueError, match="without a right to transmit"):
+        with pytest.raises(ValueError, match="must not allow transmission"):
             hear_bus(CanLinkConfig(name="b", interface="virtual", channel="x", allow_transmit=True), 0.1, SystemClock())
 
 

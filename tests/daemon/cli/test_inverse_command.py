@@ -101,7 +101,7 @@ def test_wrong_use_is_refused_in_a_sentence(model: Path, targets: Path, tmp_path
     assert "column y_mm: column missing" in missing.stderr
     onto_itself = run("inverse", "--model", model, "--data", targets, "--out", targets)
     assert onto_itself.exit_code == 2
-    assert "is the data itself" in onto_itself.stderr
+    assert "is the input file" in onto_itself.stderr
     rows[0]["pose"] = rows[1]["pose"] = "p"
     torn = run("inverse", "--model", model, "--data", written(tmp_path / "torn.csv", rows), "--json")
     assert torn.exit_code == 2

@@ -164,7 +164,7 @@ def test_a_tip_that_is_in_no_station_s_frame_says_so(tmp_path: Path) -> None:
         shown = run_apart("tip", "--prism", "r", "--socket", str(tmp_path / "s"))
     assert shown.returncode == 0
     assert "base 1.0 2.0 3.0 mm" in shown.stdout
-    assert "in no station's frame: the model does not know where the station stands" in shown.stdout
+    assert "not in a station's frame: the model does not know the station's set-up" in shown.stdout
 
 
 # ---- who may send ----------------------------------------------------------------------------------------------------
@@ -213,5 +213,5 @@ def test_an_identifier_that_the_rig_is_read_from_and_a_prism_it_lacks_are_refuse
     spare = RawSignal(device="raw", name="spare", unit="bar", arbitration_id=0x681, start_bit=0, length_bits=8)
     channels = (*source.rig.channels, spare)
     doubled = replace(source, rig=source.rig.model_copy(update={"channels": channels}))
-    with pytest.raises(ConfigError, match="681h is what channel 'spare' is read from"):
+    with pytest.raises(ConfigError, match="681h is in use by channel 'spare'"):
         decoders(configured(MAY_SEND + TIP, tmp_path), doubled)

@@ -268,7 +268,7 @@ def test_too_few_fixes_are_refused_as_unsafe(tmp_path: Path) -> None:
         (("--method", "oracle"), "'oracle' is not one of"),
         (("--effects", "witchcraft@q1"), "effect 'witchcraft' is unknown; there are"),
         (("--effects", "angle_scale@theta1"), "angle_scale may be at q1, q2, q3, q4, q5, q6 in rig 'ur10'"),
-        (("--method", "km", "--effects", "angle_scale@q1"), "--method km takes none"),
+        (("--method", "km", "--effects", "angle_scale@q1"), "--method km does not support effects"),
         (("--residual", "oracle"), "'oracle' is not one of"),
         (("--seed", "-1"), "-1 is not in the range x>=0"),
         (("--rig", "digger"), "digger: neither a shipped rig"),

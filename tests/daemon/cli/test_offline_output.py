@@ -39,7 +39,7 @@ ENDINGS = [
     (UnsafeError("not identifiable"), 3, "not identifiable"),
     (CalibrationError("no optimum"), 1, "no optimum"),
     (FileNotFoundError(2, "No such file or directory", "x.csv"), 1, "x.csv: No such file or directory"),
-    (KeyError("x"), 1, "internal error, KeyError: 'x' (RIGCAL_DEBUG=1 shows where)"),
+    (KeyError("x"), 1, "internal error, KeyError: 'x' (RIGCAL_DEBUG=1 adds a traceback)"),
 ]
 
 

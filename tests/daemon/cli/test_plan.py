@@ -111,14 +111,14 @@ def test_after_a_session_it_says_what_else_to_measure(tmp_path: Path) -> None:
     ("arguments", "sentence"),
     [
         (("--poses", "0"), "0 is not in the range"),
-        (("--poses", "5", "--station", "1,2"), "'1,2' is no place; give X,Y,Z in mm"),
-        (("--poses", "5", "--station", "1,2,nan"), "is no place"),
+        (("--poses", "5", "--station", "1,2"), "'1,2' is not a position; give X,Y,Z in mm"),
+        (("--poses", "5", "--station", "1,2,nan"), "is not a position"),
         (("--poses", "5", "--floor", "nan"), "'nan' is not a finite number"),
         (("--poses", "5", "--separate", "ghost@theta1,backlash@theta1"), "effect 'ghost' is unknown; there are"),
         (("--poses", "5", "--separate", "backlash@L9,backlash@theta1"), "backlash@L9: backlash may be at theta1"),
         (("--poses", "5", "--separate", "backlash@theta1"), "'backlash@theta1' is not two or three effects"),
         (("--poses", "5", "--separate", "joint_compliance@theta1,backlash@theta1"), "does nothing at theta1"),
-        (("--poses", "5", "--setup", "A"), "it is one of a model's: give --model"),
+        (("--poses", "5", "--setup", "A"), "names a set-up of a model; give --model"),
         (("--poses", "5", "--model", "/nonexistent"), "/nonexistent is not a directory"),
     ],
 )

@@ -51,7 +51,7 @@ def test_check_shows_places_reach_radii_and_what_data_can_show(tmp_path: Path) -
 
 def test_check_draws_the_chain_for_people() -> None:
     shown = run("rig", "check", "swdt82").stdout
-    assert "swdt82: good: 9 rows, 9 joints, 4 prisms" in shown
+    assert "swdt82: valid: 9 rows, 9 joints, 4 prisms" in shown
     side = shown.split("From the side")[1].split("From above")[0]
     assert side.count("*") >= 3
     assert "#" in side
@@ -115,7 +115,7 @@ def test_an_import_does_not_overwrite_a_rig_file(tmp_path: Path) -> None:
     mine.write_text("# a day's work\n", encoding="utf-8")
     table.write_text("joint,a_mm\nq1,1\n", encoding="utf-8")
     done = run("rig", "import", table, "--out", mine)
-    assert (done.exit_code, "is there already" in done.stderr) == (2, True), done.stderr
+    assert (done.exit_code, "exists and is not overwritten" in done.stderr) == (2, True), done.stderr
     assert mine.read_text(encoding="utf-8") == "# a day's work\n"
 
 
@@ -124,7 +124,7 @@ def test_an_import_does_not_overwrite_a_rig_file(tmp_path: Path) -> None:
     [
         (("rig", "import", "{csv}", "--tip", "x", "--out", "o"), "name links of a URDF"),
         (("rig", "import", "{urdf}", "--convention", "dh", "--out", "o"), "is for a table"),
-        (("rig", "export", "ur10", "--out", "o.stl"), "ends in one of"),
+        (("rig", "export", "ur10", "--out", "o.stl"), "must end in one of"),
         (("rig", "check", "nowhere.toml"), "nowhere.toml: there is no such file"),
         (("rig", "check", "./nowhere"), "./nowhere: there is no such file; give another path, or a shipped rig ("),
         (("rig", "check", "nowhere"), "nowhere: neither a shipped rig"),

@@ -97,7 +97,7 @@ def test_gap_finds_that_the_error_goes_with_the_signal(work: Path) -> None:
 @pytest.mark.parametrize(
     ("signal", "reason"),
     [
-        ("tilt_y_deg", "train.csv, column tilt_y_deg: the file has no such column, which --signal names"),
+        ("tilt_y_deg", "train.csv, column tilt_y_deg: the file has no such column, although --signal names it"),
         ("tilt x", "'tilt x' cannot be the column of a signal"),
         ("temperature_degC", "the column temperature_degC is already defined; remove the signal"),
     ],

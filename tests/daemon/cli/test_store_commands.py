@@ -46,7 +46,7 @@ def test_a_store_is_told_checked_backed_up_damaged_and_restored(config: Path) ->
     assert told(config, "check")["is_sound"]
     backup = told(config, "backup")["backup"]
     assert [b["path"] for b in told(config, "backup", "--list")["backups"]] == [backup]
-    assert "all is sound" in say(config, "check", "--backup", backup).stdout
+    assert "no damage found" in say(config, "check", "--backup", backup).stdout
     config.with_name("rigcal.sqlite").write_bytes(b"\0" * 8192)
     broken = say(config, "check")
     assert broken.exit_code == 1
@@ -100,9 +100,8 @@ def test_without_config_the_installed_daemon_is_meant(config: Path, monkeypatch:
     monkeypatch.setattr(client, "INSTALLED_CONFIG", config.with_name("none.toml"))
     result = CliRunner().invoke(main, ["store", "stats"])
     assert result.exit_code == 2
-    assert (
-        f"there is no {config.with_name('none.toml')}: name the daemon's configuration with --config" in result.stderr
-    )
+    remedy = "give the daemon's configuration with --config"
+    assert f"{config.with_name('none.toml')} does not exist; {remedy}" in result.stderr
     monkeypatch.setattr(client, "INSTALLED_CONFIG", config)
     assert str(config.with_name("rigcal.sqlite")) in CliRunner().invoke(main, ["store", "stats"]).stdout
 

@@ -150,7 +150,7 @@ def test_an_operator_who_asks_for_jobs_before_there_are_any_is_told_when_there_w
     server.close()
     store.close()
     assert done.exit_code == 0
-    assert "`rigcal session start` opens a session, and its jobs are queued after it is closed" in done.stdout
+    assert "jobs are queued after a session is closed; `rigcal session start` opens a session" in done.stdout
 
 
 HOSTILE_JSON = {

@@ -159,7 +159,7 @@ def test_the_command_writes_a_page_and_a_table(directory: Path, tmp_path: Path) 
     assert (told["rigs"], list(told["failed"])) == (7, ["bad"])
     assert "column missing" in told["failed"]["bad"]
     page = (out / "fleet.html").read_text()
-    assert "7 rigs held against each other" in page
+    assert "Comparison of 7 rigs" in page
     assert "http" not in page.replace("http://www.w3.org", "")
     table = pd.read_parquet(told["table"])
     assert set(table["rig_name"]) >= {"rig0000", "rig20"}
@@ -187,7 +187,7 @@ def test_a_rig_without_data_is_listed_and_a_bad_line_has_its_file(tmp_path: Path
     sources = find_rigs([tmp_path / "bad", tmp_path / "empty"], None, None)
     bad, empty = assess_all(sources, SETTINGS, tmp_path / "out", Here(), lambda *_: None)
     assert bad["error"].startswith("b.csv, line 5, column ")
-    assert empty["error"].endswith("neither a rigcal.sqlite nor CSV files of observations in it")
+    assert empty["error"].endswith("contains neither a rigcal.sqlite nor CSV files of observations")
 
 
 def test_a_fault_of_the_program_at_one_rig_does_not_end_the_others(
@@ -207,8 +207,8 @@ def test_a_fault_of_the_program_at_one_rig_does_not_end_the_others(
 def test_wrong_places_are_refused(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"neither a rigcal\.sqlite nor CSV files"):
         find_rigs([tmp_path], None, None)
-    with pytest.raises(DataError, match="no such store"):
+    with pytest.raises(DataError, match="matches no store"):
         find_rigs([], str(tmp_path / "*.sqlite"), None)
     (tmp_path / "a.csv").write_text("prism\n")
-    with pytest.raises(DataError, match="the same rig is named twice"):
+    with pytest.raises(DataError, match="the same rig is given twice"):
         find_rigs([tmp_path, tmp_path], None, None)

@@ -171,7 +171,7 @@ def test_hands_of_a_simulated_rig_aim_and_go_where_the_guide_says(daemon: Daemon
     assert hand("aim", "r") == "the station is aimed at r\n"
     daemon.say("guide.done")
     daemon.wait("a pose", lambda: state(daemon)["step"]["kind"] == "go_to_pose")
-    assert hand("move").startswith("the boom goes to theta1_deg")
+    assert hand("move").startswith("the boom moves to theta1_deg")
     daemon.wait("the boom", lambda: all(joint["is_there"] for joint in state(daemon)["joints"]))
     assert "theta1 is given twice" in hand("move", "theta1=1", "theta1=2")
 

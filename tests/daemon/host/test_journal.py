@@ -131,5 +131,5 @@ def test_a_job_whose_sessions_are_used_no_more_fails_with_a_sentence(
     Store(tmp_path / "none.sqlite").close()
     outcome = follow(order(tmp_path))
     assert outcome.state == "failed"
-    assert "none of those that the job was queued for may be used any more" in str(outcome.error)
+    assert "none that the job was queued for can be used any more" in str(outcome.error)
     assert not any("Traceback" in text for _, text in said(caplog))

@@ -125,7 +125,7 @@ def test_errors_that_are_too_small_are_told_and_trigger_nothing(rig: JobRig) -> 
     check(rig, "c1", jobs=7)
     assert drift(rig)["alarm"] == "better"
     rig.look_on()
-    assert "drift of model 2: none; the machine is truer than the model says" in "\n".join(lines(rig))
+    assert "drift of model 2: none; errors are smaller than the model predicts" in "\n".join(lines(rig))
     assert len(kinds(rig)) == 7
 
 
@@ -255,8 +255,8 @@ def test_status_says_verdict_next_measurements_and_drift(rig: JobRig) -> None:
     rig.plan(drift=f"scores {CLIP} {CLIP} {CLIP}")
     check(rig, "c1", jobs=12)
     assert lines(rig)[-1] == (
-        "drift of model 2: the machine has left the model (since check session c1); 1 check session, in the last, c1, "
-        "errors are 1.0 times the predicted (sums 6.0 and 0 of 5.0)"
+        "drift of model 2: the machine has drifted from the model (since check session c1); 1 check session, in the "
+        "last, c1, errors are 1.0 times the predicted ones (sums 6.0 and 0 of 5.0)"
     )
 
 

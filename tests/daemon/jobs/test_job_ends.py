@@ -37,14 +37,14 @@ def test_a_fault_inside_a_job_is_its_error(rig: JobRig) -> None:
     with JobChild(order) as child:
         assert child.next_message(60.0) == Started(child.pid)
         message = child.next_message(60.0)
-    assert message == Outcome("failed", "KeyError: 'no such kind'; the daemon's log has the whole story")
+    assert message == Outcome("failed", "KeyError: 'no such kind'; see the daemon's log for details")
     assert is_gone(child.pid)
 
 
 @pytest.mark.parametrize(
     ("what", "error"),
     [
-        ("garbage", "its process said 'Segmentation fault', which is no message of a job"),
+        ("garbage", "its process sent 'Segmentation fault', which is not a message of a job"),
         ("mute", "its process ended with status 7 and no result"),
         ("killed", "its process was killed by signal 9 (Killed)"),
     ],
@@ -104,7 +104,7 @@ def test_a_command_that_cannot_be_started_is_tried_as_often_as_allowed(tmp_path:
         rig.clock.advance(6.0)
         rig.wait(lambda: rig.job(1)["attempts"] == 2, "a second attempt")
         rig.wait_for("failed", "cancelled", "cancelled", "cancelled")
-        assert rig.job(1)["error"].startswith("interrupted 2 times, as often as [jobs] max_attempts allows")
+        assert rig.job(1)["error"].startswith("interrupted 2 times, the most that [jobs] max_attempts allows")
         assert "queued" not in rig.states()
     finally:
         rig.close()

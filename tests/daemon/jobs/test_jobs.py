@@ -176,7 +176,7 @@ def test_a_cancellation_after_the_end_is_refused_and_forgotten(rig: JobRig) -> N
     assert chosen is not None
     jobs.begin(chosen, 60.0)
     jobs.end(1, Outcome("failed", "the data are too poor"))
-    with pytest.raises(CommandError, match="job 1 is failed; only one that has not ended can be cancelled"):
+    with pytest.raises(CommandError, match="job 1 is failed; only a job that has not ended can be cancelled"):
         jobs.cancel(1)
     assert not jobs.is_cancelled(1)
 
@@ -204,9 +204,9 @@ def test_what_makes_no_sense_is_refused_in_a_sentence(rig: JobRig) -> None:
     runner = rig.start()
     rig.wait_for("done", "failed", "cancelled", "cancelled")
     for command, number, why in (
-        (runner.retry_command, 1, "job 1 is done; only one that did not end well can be retried"),
+        (runner.retry_command, 1, "job 1 is done; only a failed, cancelled or interrupted job can be retried"),
         (runner.cancel_command, 1, "job 1 is done"),
-        (runner.retry_command, 3, "job 3 waits for job 2, which is failed; retry that one"),
+        (runner.retry_command, 3, "job 3 depends on job 2, which is failed; retry job 2"),
         (runner.cancel_command, 99, "there is no job 99"),
         (runner.retry_command, "1", "there is no job '1'"),
     ):
@@ -219,7 +219,7 @@ def test_a_job_whose_restarts_never_end_is_given_up_and_can_be_retried(rig: JobR
     rig.store.update("jobs", {"id": 1}, {"state": "interrupted", "interruptions": 20})
     rig.start()
     rig.wait_for("failed", "cancelled", "cancelled", "cancelled")
-    assert rig.job(1)["error"].startswith("cut off 20 times by what is not its own fault")
+    assert rig.job(1)["error"].startswith("interrupted 20 times through no fault of its own")
     rig.stop()
     jobs.retry(1)
     assert rig.job(1)["interruptions"] == 0

@@ -63,4 +63,4 @@ def test_a_killed_daemons_job_ends_with_it_and_runs_again_in_the_next(tmp_path: 
         "error": "the daemon was stopped",
     }
     assert is_gone(pid)
-    assert "offered again after an interruption" in again.log_text()
+    assert "queued again after an interruption" in again.log_text()

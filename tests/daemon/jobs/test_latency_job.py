@@ -75,6 +75,6 @@ def test_a_report_tells_the_latency_of_each_session(rig: JobRig, tmp_path: Path)
 
 def test_sentences_for_people() -> None:
     known = {"seconds": 0.0424, "standard_error_s": 0.005, "fixes": 312, "motions": 24}
-    assert latency_sentence(known) == ("42 ms, give or take 5 ms, beyond link_delay_s (from 312 fixes of 24 motions)")
-    assert latency_sentence({"reason": "why"}) == "not known: why"
+    assert latency_sentence(known) == ("42 ms +- 5 ms in addition to link_delay_s (from 312 fixes of 24 motions)")
+    assert latency_sentence({"reason": "why"}) == "unknown: why"
     assert newest_latency({"c": {"reason": "why"}}) is None

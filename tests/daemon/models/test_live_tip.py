@@ -134,7 +134,7 @@ def test_readings_of_another_boot_give_no_position_whatever_the_clock_shows(rig:
         rig.tip.on_records([])  # the bus stays silent
         tip = rig.tip.tip("r")
         assert (tip.status, tip.base_mm, tip.age_s, tip.utc_ns) == (TipStatus.STALE, None, None, None)
-        assert tip.reason == "the joints were last read before the computer was started anew; is the bus silent?"
+        assert tip.reason == "the joints were last read before the computer was restarted; is the bus silent?"
     rig.drive(pose(1))
     assert rig.tip.tip("r").status is TipStatus.OK
 

@@ -128,4 +128,4 @@ def test_a_path_travelled_since_the_training_is_doubted(trained: Trained) -> Non
     tip = rig.tip.tip("r")
     assert tip.status is TipStatus.DOUBTFUL
     (warning,) = tip.warnings
-    assert warning.startswith("transducer_cumulative@L2 grows with the path that L2 travels")
+    assert warning.startswith("transducer_cumulative@L2 grows with the distance that L2 travels")

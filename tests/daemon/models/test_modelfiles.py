@@ -69,7 +69,7 @@ def test_a_model_of_channels_that_a_file_decoded_otherwise_is_refused(written: P
     write_model(path, replace(model, rig=before, rig_text=before.text, provenance=provenance))
     for rig in (before, model.rig):
         assert read_model_of_rig(path, model_sha256(path), rig).rig.decoding == before.decoding
-    with pytest.raises(UnsafeError, match="was made for another rig file"):
+    with pytest.raises(UnsafeError, match="was made for a rig file"):
         read_model_of_rig(path, model_sha256(path), after)
     assert read_model_of_rig(written, model_sha256(written), after).rig.decoding == {}, "an older model goes on"
 
@@ -161,7 +161,7 @@ def test_a_directory_with_more_than_a_model_is_not_read(model_directory: Path, m
     manifest = json.loads((model_directory / "manifest.json").read_text())
     manifest["files"] |= {f"file{n}": {"sha256": "", "bytes": 0} for n in range(40)}
     (model_directory / "manifest.json").write_text(json.dumps(manifest))
-    with pytest.raises(ModelError, match="lists 48 files, a model has 32 at most"):
+    with pytest.raises(ModelError, match="lists 48 files; a model has at most 32"):
         read_model(model_directory)
 
 
@@ -172,7 +172,7 @@ def test_a_model_that_takes_its_reader_down_is_named(model_directory: Path, monk
     killer.chmod(0o755)
     reseal(model_directory)  # another manifest, so that it was not checked before
     monkeypatch.setattr("sys.executable", str(killer))
-    with pytest.raises(ModelError, match=r"kills the process that loads it \(SIGSEGV\)"):
+    with pytest.raises(ModelError, match=r"crashes the process that loads it \(SIGSEGV\)"):
         read_model(model_directory)
 
 
@@ -243,7 +243,7 @@ def test_only_a_free_place_or_a_model_is_written_over(model_directory: Path, tmp
     with pytest.raises(ModelError, match="neither empty nor a model directory"):
         write_model(tmp_path / "home", small_calibration()[0])
     (model_directory / "notes.txt").write_text("mine")
-    with pytest.raises(ModelError, match=r"holds 'notes\.txt'"):
+    with pytest.raises(ModelError, match=r"contains 'notes\.txt'"):
         check_target(model_directory)
 
 

@@ -64,7 +64,7 @@ def test_a_candidate_is_compared_on_check_sessions_then_accepted_and_loaded(rig:
     measured(rig, "c", 4, "check")
     model = rig.candidate()
     assert rig.registry.compare_command({"id": model}) == f"job 2 will compare model {model} with the live one"
-    assert "job 2 is yet to compare it: wait" in refusal(rig.registry.accept_command, REFUSED, id=model)
+    assert "wait for job 2, which will compare it" in refusal(rig.registry.accept_command, REFUSED, id=model)
     compared = rig.compare()
     assert compared["against"] == "nominal"
     assert (compared["sessions"], compared["fixes"], compared["standstills"]) == (["c"], 8, 4)
@@ -92,8 +92,8 @@ def test_the_model_of_an_early_stage_names_the_job_that_compares_the_last_one(ri
     queue.end(gap, Outcome("done", result=result | {"sessions": ["a"], "metrics": {}}))
     (model,) = rig.models.all()
     assert refusal(rig.registry.accept_command, REFUSED, id=model.id) == (
-        f"model {model.id} was not compared with held-out data yet; job {comparison} compares the model that job "
-        f"{residual} makes of the same sessions: wait for that one"
+        f"model {model.id} was not compared on held-out data yet; wait for job {comparison}, which will compare the "
+        f"model that job {residual} makes of the same sessions"
     )
 
 
@@ -165,7 +165,7 @@ def test_a_live_model_of_another_rig_file_says_nothing_of_the_readings_of_this_o
     rig.registry.compare_command({"id": rig.candidate(poses=40)})
     compared = rig.compare()
     assert (compared["live"], compared["against"]) == (live, "nominal")
-    assert compared["sentence"].startswith("the live model is of another rig file (its channel L2 has zero_counts = 9")
+    assert compared["sentence"].startswith("the live model has a different rig file (its channel L2 has zero_counts")
 
 
 def test_in_place_of_a_damaged_live_model_nothing_goes_live_on_one_standstill(rig: ModelRig) -> None:
@@ -183,7 +183,7 @@ def test_in_place_of_a_damaged_live_model_nothing_goes_live_on_one_standstill(ri
 def test_without_held_out_data_nothing_goes_live(rig: ModelRig) -> None:
     model = rig.candidate()
     assert "hold a check session" in refusal(rig.registry.accept_command, REFUSED, id=model)
-    assert "no check session is closed" in refusal(rig.registry.compare_command, REFUSED, id=model)
+    assert "no closed check session can be used" in refusal(rig.registry.compare_command, REFUSED, id=model)
     rig.jobs.session("c", kind="check")
     trained_on_it = rig.candidate(sessions=("c",))
     rig.registry.compare_command({"id": trained_on_it})
@@ -226,7 +226,7 @@ def test_a_verdict_that_changes_while_the_model_is_loaded_does_not_count(
 
     monkeypatch.setattr(rig.live, "load", load)
     told = refusal(rig.registry.accept_command, REFUSED, id=model)
-    assert "another command or comparison changed the models meanwhile" in told
+    assert "the models were changed in the meantime by another command" in told
     assert states(rig) == {model: "candidate"}
 
 
@@ -236,7 +236,7 @@ def test_a_comparison_that_no_job_would_make_is_not_promised(tmp_path: Path) -> 
         jobs.session("c", kind="check")
         runner = JobRunner(jobs.store, jobs.config, "swdt82", jobs.clock)
         row = ModelRow(1, "swdt82", "candidate", "hybrid", tmp_path, "ab", ("a",), 0, {})
-        with pytest.raises(CommandError, match=r"jobs are switched off; set \[jobs\] enabled = true") as caught:
+        with pytest.raises(CommandError, match=r"jobs are disabled; set \[jobs\] enabled = true") as caught:
             runner.compare(row)
         assert caught.value.status == REFUSED
         assert jobs.jobs() == []
@@ -248,7 +248,7 @@ def test_a_comparison_with_a_model_that_is_live_no_more_does_not_count(rig: Mode
     early = rig.compared(rig.candidate(), live=None)
     live = rig.accepted(poses=40)
     told = refusal(rig.registry.accept_command, REFUSED, id=early)
-    assert f"no model was live, and model {live} is live now; `rigcal model compare {early}`" in told
+    assert f"no model was live, but model {live} is live now; `rigcal model compare {early}`" in told
 
 
 # ---- back ------------------------------------------------------------------------------------------------------------
@@ -258,7 +258,7 @@ def test_nothing_is_named_where_no_other_model_was_ever_live(rig: ModelRig) -> N
     live = rig.accepted(30)
     rig.candidate()
     told = refusal(rig.registry.rollback_command, WRONG_USE)
-    assert told == f"model {live} is the first that went live, and replaced none; accept a better one"
+    assert told == f"model {live} was the first to go live and has no predecessor; accept a better model"
 
 
 def test_rollback_puts_back_what_the_live_model_replaced_step_by_step(rig: ModelRig) -> None:
@@ -267,7 +267,7 @@ def test_rollback_puts_back_what_the_live_model_replaced_step_by_step(rig: Model
     assert rig.registry.rollback_command({})["live"] == one
     assert states(rig) == {one: "live", two: "retired", three: "retired"}
     told = refusal(rig.registry.rollback_command, WRONG_USE)
-    assert f"the first that went live, and replaced none; name another, as `rigcal model rollback {three}`" in told
+    assert f"the first to go live and has no predecessor; name one, as `rigcal model rollback {three}`" in told
     assert rig.registry.rollback_command({"id": three})["retired"] == one
     assert rig.registry.rollback_command({})["live"] == two, "what the third had replaced when it was accepted"
     loaded = rig.settled()
@@ -327,7 +327,7 @@ def test_where_no_model_is_live_a_word_about_the_zeros_is_about_the_one_that_wai
     model = rig.models.get(rig.candidate())
     rig.clock.advance(10.0)
     rig.store.insert_records([DeviceEvent("theta1", rig.clock.now(), EventKind.PRESET_JUMP, "position jumped")])
-    assert rig.registry.zeros_checked_command({}) == f"model {model.id}: jumps until now count no more: theta1"
+    assert rig.registry.zeros_checked_command({}) == f"model {model.id}: earlier jumps are now ignored: theta1"
     assert rig.models.jumped(model) == {}
     assert not rig.models.was_live(model)
     assert states(rig) == {model.id: "candidate"}
@@ -386,7 +386,7 @@ def test_a_model_of_another_rig_does_not_go_live(rig: ModelRig) -> None:
     model = rig.compared(rig.candidate(), live=None)
     rig.store.update("models", {"id": model}, {"rig": "ur10"})
     for command in (rig.registry.accept_command, rig.registry.rollback_command, rig.registry.compare_command):
-        assert "is of rig 'ur10', and this is rig 'swdt82'" in refusal(command, REFUSED, id=model)
+        assert "is of rig 'ur10', but this is rig 'swdt82'" in refusal(command, REFUSED, id=model)
 
 
 def test_a_model_stays_live_where_the_rig_file_has_another_comment_or_signal(tmp_path: Path) -> None:
@@ -411,9 +411,9 @@ def test_a_model_of_another_rig_file_does_not_go_live_and_a_live_one_is_not_used
         state = after.settled()
         assert isinstance(state, Missing)
         assert state.is_defect
-        assert "was made for another rig file" in state.reason
+        assert "was made for a rig file" in state.reason
         other = after.compared(after.candidate(), live=model)
-        assert "another rig file" in refusal(after.registry.accept_command, REFUSED, id=other)
+        assert "that describes a different machine" in refusal(after.registry.accept_command, REFUSED, id=other)
     finally:
         after.close()
 
@@ -530,7 +530,7 @@ def test_a_load_that_a_stop_cuts_short_is_no_defect_of_the_model(
 def test_a_rejected_candidate_never_goes_live(rig: ModelRig) -> None:
     live = rig.accepted()
     model = rig.compared(rig.candidate(), live=live)
-    assert "say why" in refusal(rig.registry.reject_command, WRONG_USE, id=model)
+    assert "give a reason" in refusal(rig.registry.reject_command, WRONG_USE, id=model)
     assert rig.registry.reject_command({"id": model, "reason": "measured in a storm", "operator": "Ada"})
     change = rig.registry.show_command({"id": model})["history"][-1]
     assert (change["state"], change["reason"], change["operator"]) == (

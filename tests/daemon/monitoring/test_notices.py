@@ -189,7 +189,7 @@ def test_a_receiver_that_answers_byte_by_byte_does_not_hold_up_the_other_way(
             sender.tell("raised", "boom")
             wait_until(lambda: mail.exists() and "boom" in mail.read_text(encoding="utf-8"))
             wait_until(lambda: bool(sender.notices.faults()))
-            assert sender.notices.faults() == {"webhook": "127.0.0.1: no whole answer within 0.5 s"}
+            assert sender.notices.faults() == {"webhook": "127.0.0.1: no complete answer within 0.5 s"}
             assert hung_up.wait(10.0), "the connection is closed, not left open"
         finally:
             hung_up.set()
@@ -349,7 +349,7 @@ def test_a_daemon_tells_of_its_alarms_and_of_a_test(
     monkeypatch.setattr("daemon.monitoring.notices.USUAL", FAST)
     with idle_daemon(tmp_path, notify=NotifySection(webhook_url=web.url)) as config:
         told = request(config.socket_path, "alarms.test-notice")
-        assert told.startswith("a test notice goes out by webhook")
+        assert told.startswith("a test notice is being sent by webhook")
         (tmp_path / "models" / "job-1").mkdir(parents=True)  # models beside a store that never saw a job: an alarm
         wait_until(lambda: ("raised", "store") in web.events())
         assert ("test", "notices") in web.events()

@@ -75,7 +75,7 @@ def test_callers_who_drip_are_hung_up_on_and_meanwhile_it_is_told_that_nobody_el
     monkeypatch.setattr(scrape_server, "LONGEST_S", 1.0)
     with callers(server, scrape_server.MOST_AT_ONCE) as dripping, callers(server, 1) as (refused,):
         assert refused.recv(1) == b""
-        assert "16 callers" in (server.trouble() or "")
+        assert "16 connections" in (server.trouble() or "")
         wait_until(lambda: drip(dripping))
         assert b"process_open_fds" in scrape(server)
         assert server.trouble() is None

@@ -42,4 +42,4 @@ def test_sentences_for_people() -> None:
     assert sentence(ClockState(True, -1.5, 2.0, "kernel")) == "synchronised (kernel), 1.5 s behind, off by at most 2 s"
     assert sentence(ClockState(True, None, 0.25, "kernel")) == "synchronised (kernel), off by at most 250 ms"
     assert sentence(LEFT) == "not synchronised with other clocks"
-    assert sentence(ClockState(None, error="why")) == "it is not known whether it is synchronised (why)"
+    assert sentence(ClockState(None, error="why")) == "unknown whether it is synchronised (why)"

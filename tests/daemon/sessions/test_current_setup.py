@@ -101,7 +101,7 @@ def test_a_set_up_that_is_described_while_a_session_is_being_started_is_the_sess
 
 
 def test_a_session_is_not_opened_for_a_caller_who_has_left(session_rig: Rig) -> None:
-    with acting_for(None, lambda: True), pytest.raises(CommandError, match="given up, as nobody waits"):
+    with acting_for(None, lambda: True), pytest.raises(CommandError, match="its caller has disconnected"):
         session_rig.say("start", prism="r")
     assert session_rig.keeper.open_session() is None
 

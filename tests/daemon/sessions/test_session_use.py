@@ -236,7 +236,7 @@ def test_a_check_session_without_control_shots_judges_nothing_until_it_is_accept
     check = uncontrolled(session_rig, "check")
     assert jobs.due() == []
     model = jobs.table._models.all()[-1]
-    with pytest.raises(CommandError, match="no check session is closed and used"):
+    with pytest.raises(CommandError, match="no closed check session can be used"):
         jobs.table.compare(model)
     session_rig.say("accept", id=check)
     assert jobs.due() == [DueChain(CHECKS, check, check)]

@@ -112,8 +112,8 @@ def test_what_the_simulated_boom_does_less_than_a_plan_asks_is_said(rig: Rig) ->
     assert concessions(rig, [can]) == []
     later = can | {"time_s": 900.0 + 3 * 3600.0, "temperature_degC": 5.0, "L2_rate": 20.0}
     assert concessions(rig, [can, later]) == [
-        "The plan asks for rounds over 3 h; here they are over 30 min.",
-        "What the simulated boom cannot do, and leaves: L2_rate, temperature_degC.",
+        "The plan's rounds span 3 h; here they span 30 min.",
+        "Conditions that the simulated boom cannot fulfil and ignores: L2_rate, temperature_degC.",
     ]
 
 

@@ -16,12 +16,12 @@ def job(kind: str, state: str, progress: float = 0.0, message: str = "") -> dict
 @pytest.mark.parametrize(
     ("jobs", "share", "text"),
     [
-        ([], 0.0, "waiting for identification and missing physics"),
-        ([job("gap", "running", 0.5, "solving")], 1 / 8, "identification and missing physics: solving"),
+        ([], 0.0, "waiting for identification and missing effects"),
+        ([job("gap", "running", 0.5, "solving")], 1 / 8, "identification and missing effects: solving"),
         (
             [job("gap", "done", 1.0), job("residual", "running"), job("report", "queued")],
             1 / 4,
-            "learning what remains: starting",
+            "training of the residual model: starting",
         ),
         ([job("gap", "done", 1.0), job("residual", "done", 1.0)], 1 / 2, "waiting for the report"),
         ([job(kind, "done") for kind in ("gap", "residual", "report")], 3 / 4, "waiting for the comparison of models"),
@@ -30,7 +30,7 @@ def job(kind: str, state: str, progress: float = 0.0, message: str = "") -> dict
             1.0,
             "waiting for the jobs to end",
         ),
-        ([job("gap", "failed", 0.4), job("gap", "queued")], 0.0, "waiting for identification and missing physics"),
+        ([job("gap", "failed", 0.4), job("gap", "queued")], 0.0, "waiting for identification and missing effects"),
     ],
 )
 def test_the_progress_of_the_jobs_is_told(jobs: list[dict[str, Any]], share: float, text: str) -> None:

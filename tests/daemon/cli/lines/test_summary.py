@@ -133,14 +133,14 @@ def test_what_does_not_fit_is_counted_with_the_command_that_shows_it() -> None:
     text = screen(WORST)
     told = text.count("CRITICAL joint_silent")
     assert told >= 5
-    assert f"and {9 - told} more: `rigcal alarms` has all" in text
-    assert "... 10 more lines: `rigcal status --all` has them" in text
+    assert f"and {9 - told} more: `rigcal alarms` shows all" in text
+    assert "... 10 more lines: `rigcal status --all` shows them" in text
 
 
 def test_open_gaps_follow_the_alarms_however_many_these_are() -> None:
     text = screen(WORST | {"acquisition": acquired(gaps=[gap("silent", 3), gap("link_down", 4)])})
     assert text.count("CRITICAL joint_silent") >= 4
-    _, after = text.split("more: `rigcal alarms` has all\n")
+    _, after = text.split("more: `rigcal alarms` shows all\n")
     first, second, *_ = after.splitlines()
     assert first == "gaps      silent for 41 s: theta3"
     assert second == "          link down for 41 s: theta4"
@@ -162,8 +162,8 @@ def test_failed_decodes_and_jobs_push_nothing_out() -> None:
     for label in ("gaps", "links", "channels", "station", "session", "jobs", "models"):
         assert f"\n{label:10}" in text
     assert "theta8 could not be decoded (8 in the last minute)" in text, "what fails now comes first"
-    assert "and 7 more: `rigcal status --all` has all" in text
-    assert "and 5 more: `rigcal jobs list` has all" in text
+    assert "and 7 more: `rigcal status --all` shows all" in text
+    assert "and 5 more: `rigcal jobs list` shows all" in text
     assert "more lines" not in text
 
 
@@ -212,7 +212,7 @@ GUIDE = {
         ),
         (status(jobs=WORST["jobs"]), "`rigcal watch`"),
         (status(models={"live": None, "candidate": CANDIDATE}), "`rigcal model accept 2`"),
-        (status(models={"live": {"id": 1}, "candidate": None}), "nothing needs doing"),
+        (status(models={"live": {"id": 1}, "candidate": None}), "nothing to do"),
         (status(guide=GUIDE, session=session()), "aim the station at prism r and say so: `rigcal session guide`"),
         (status(guide=GUIDE, alarms={"active": [alarm(1, "warning")], "looked_age_s": 0.5}), "aim the station"),
         (status(guide=GUIDE, alarms={"active": [alarm(1)], "looked_age_s": 0.5}), "theta1: Check the encoder's power"),
@@ -227,7 +227,7 @@ def test_the_state_is_one_sentence() -> None:
     assert state_sentence(status()) == "ready, no model is live, no session is open"
     assert state_sentence(status(session=session())).startswith("recording session s001-r")
     held = status(alarms={"active": [], "looked_age_s": 90.0})
-    assert state_sentence(held).startswith("held up")
+    assert state_sentence(held).startswith("blocked")
 
 
 def test_a_job_that_runs_never_stands_at_100_percent() -> None:
@@ -243,14 +243,14 @@ def test_status_and_watch_of_a_daemon_are_plain_where_they_are_piped(tmp_path: P
         assert len(shown.stdout.splitlines()) <= LINES
         assert "\x1b" not in shown.stdout
         told = json.loads(CliRunner().invoke(main, ["status", *socket, "--json"]).stdout)
-        assert told["summary"]["next"].startswith("describe where the station stands")
+        assert told["summary"]["next"].startswith("record the station's set-up")
         watched = CliRunner().invoke(main, ["watch", "--count", "2", "--interval", "0.2", *socket])
         assert (watched.exit_code, len(watched.stdout.splitlines())) == (0, 2)
         assert "theta1" in watched.stdout
         assert "\x1b" not in watched.stdout
     lost = CliRunner().invoke(main, ["watch", "--count", "1", *socket])
     assert lost.exit_code == 0
-    assert "connection lost, trying again" in lost.stdout
+    assert "connection lost, retrying" in lost.stdout
 
 
 def test_watch_refreshes_a_terminal_and_leaves_it_as_it_was(tmp_path: Path) -> None:
