@@ -244,6 +244,9 @@ class Format:
         content: makes the content of the file.
         left_out: returns the parts of the model that the format leaves out, and the resulting error.
         is_default: True if it is written when no format is requested.
+        has_grid: True if it contains the grid of corrections, whose summary and warnings the command prints.
+        rig_text: makes the file from a chain, its parameters (p,) and remarks, if it describes kinematics alone.
+            `rigcal rig export` uses it for the machine according to its drawings.
     """
 
     name: str
@@ -252,6 +255,8 @@ class Format:
     content: Callable[[Export], bytes]
     left_out: Callable[[Export], LeftOut] = lambda _: LeftOut(())
     is_default: bool = False
+    has_grid: bool = False
+    rig_text: Callable[[Chain, Floats, Sequence[str]], str] | None = None
 
 
 def kinematics_format(name: str, file: str, about: str, text: Callable[[Chain, Floats, Sequence[str]], str]) -> Format:
@@ -268,7 +273,7 @@ def kinematics_format(name: str, file: str, about: str, text: Callable[[Chain, F
         model = export.model
         return text(model.chain, model.values, export.heading(export.kinematics_alone)).encode()
 
-    return Format(name, file, about, content, lambda export: export.kinematics_alone)
+    return Format(name, file, about, content, lambda export: export.kinematics_alone, rig_text=text)
 
 
 def shortest(value: float) -> str:

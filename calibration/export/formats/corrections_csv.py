@@ -39,4 +39,5 @@ FORMAT = Format(
     _content,
     lambda export: export.left_out_of_grid,
     is_default=True,
+    has_grid=True,
 )

@@ -39,4 +39,5 @@ FORMAT = Format(
     "the grid's table as Parquet",
     _content,
     lambda export: export.left_out_of_grid,
+    has_grid=True,
 )

@@ -20,8 +20,6 @@ from daemon.warm_up import prepare
 if TYPE_CHECKING:
     from calibration.export.model_export import Format
 
-_GRIDS = ("grid", "parquet")
-
 
 @click.group()
 def model() -> None:
@@ -192,7 +190,7 @@ def model_export(
         "files": [str(out / name) for name in contents],
         "leaves_out": {file: left.as_dict() for file, left in left_out.items()},
     }
-    has_grid = any(made.name in _GRIDS for made in chosen)
+    has_grid = any(made.has_grid for made in chosen)
     warnings: Sequence[str] = export.summary["warnings"] if has_grid else ()
     result |= export.summary if has_grid else {}
     if not as_json:

@@ -157,13 +157,11 @@ def rig_export(path: str, out: Path, *, as_json: bool) -> dict[str, Any]:
     """
     import numpy as np
 
-    from calibration.export.formats.dh_csv import dh_text
-    from calibration.export.formats.urdf import urdf_text
-    from calibration.export.formats.xacro import xacro_text
+    from calibration.export.formats import formats
     from calibration.kinematics.chain import Chain, Placement
     from daemon.rig_files import load_rig
 
-    writers = {".urdf": urdf_text, ".xacro": xacro_text, ".csv": dh_text}
+    writers = {Path(made.file).suffix: made.rig_text for made in formats().values() if made.rig_text is not None}
     if out.suffix not in writers:
         raise click.UsageError(f"--out must end in one of {', '.join(writers)}, but {out.name} does not")
     rig = load_rig(path).rig
