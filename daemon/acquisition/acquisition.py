@@ -1,9 +1,9 @@
-"""Acquisition: one thread per link, bounded queues, and the one thread that writes.
+"""Acquisition: one thread per link, bounded queues, and a single writer thread.
 
 The writer drains the queues, commits the raw captures, decodes them batch by batch, commits the records, and hands
-them on; whatever keeps it from decoding, raw captures are committed first. A process that ends between the two commits
-leaves chunks that the store knows as undecoded; the next one goes live at once and decodes them before what it captures
-itself (`daemon.acquisition.backlog`). A replay runs the same writer without threads (`run_inline`).
+them on. Raw captures are always committed first, even while decoding is not possible. A process that ends between the
+two commits leaves chunks marked as undecoded in the store; the next process starts capturing at once, and decodes those
+chunks before its own (`daemon.acquisition.backlog`). A replay runs the same writer without threads (`run_inline`).
 """
 
 from __future__ import annotations
@@ -52,19 +52,19 @@ ALIVE_NS = NS_PER_S
 RETRY_S = 1.0
 WRITE_HUNG_S = 4.0  # real seconds after which a write that has not ended is told
 STOP_S = 15.0  # real seconds
-LINKS_STOP_S = 5.0  # of them for all links together, which look at `stop` several times a second
-LAST_RETRIES = 3  # when stopping, RETRY_S apart; then what could not be stored is given up, and the log says how much
+LINKS_STOP_S = 5.0  # part of STOP_S for all links together, which check `stop` several times a second
+LAST_RETRIES = 3  # when stopping, RETRY_S apart; then captures that could not be stored are discarded and counted
 INLINE_CAPTURES = 4096
 INLINE_SPAN_NS = NS_PER_S
 
-# What is wrong with a record, in place of with the disk: out of a column's range or type, text that is no UTF-8.
+# Faults of a record, not of the disk: out of a column's range or type, text that is not UTF-8.
 _REFUSED = (sqlite3.IntegrityError, sqlite3.ProgrammingError, ArithmeticError, TypeError, ValueError)
 
 _LINK_LEVELS = {EventKind.LINK_UP: logging.INFO, EventKind.LINK_LOST: logging.WARNING}
 
 
 class AcquisitionError(Exception):
-    """Acquisition has failed in a way that only a new start can mend."""
+    """Acquisition has failed in a way that only a restart can correct."""
 
 
 class Acquisition:
@@ -72,18 +72,19 @@ class Acquisition:
 
     Args:
         links: the link loops.
-        decoders: for each link, what makes its decoder. A decoder lives within one boot: captures of another boot,
-            and those that a killed run left undecoded, get a fresh one. A link without a decoder is only captured.
-        store: where everything goes.
-        clock: for ticks, lags and ages.
-        batch_seconds: how long captures are gathered before they are committed, in real time: it bounds how often
-            the disk must sync.
+        decoders: link -> function that makes its decoder. A decoder is used within one boot: captures of a different
+            boot, and those that a killed run left undecoded, get a fresh decoder. A link without a decoder is only
+            captured.
+        store: the database.
+        clock: clock for ticks, lags and ages.
+        batch_seconds: how long captures are gathered before they are committed, in real time; it limits how often the
+            disk must sync.
         queue_captures: how many captures of one link may wait while the disk is slow.
-        on_records: called in the writer's thread with records after they were committed, and with none when time has
-            passed (ten times a second). What it stores it commits itself.
-        expected: what should be heard, for `status`.
-        clock_watch: looks after the computer's clock, live; none where the clock is another one.
-        thinning: chooses the readings and fixes to store; all of them by default.
+        on_records: called in the writer thread with records after they are committed, and with an empty list when time
+            has passed (ten times a second). It must commit its own writes.
+        expected: devices from which data are expected, for `status`.
+        clock_watch: detects steps of the computer's clock, live; None where a different clock is used.
+        thinning: chooses the readings and fixes to store; all by default.
     """
 
     def __init__(
@@ -107,10 +108,10 @@ class Acquisition:
         self._factories = decoders
         self._decoding = self._new_decoding()
         self._backlog = Backlog(store, clock)
-        self._is_left_over = False  # what is decoded now, a run before this one captured
+        self._is_left_over = False  # the captures being decoded are of an earlier run
         self._decoded: _Decoded | None = None
         self._next_tick_ns = 0
-        self._unstored = 0  # captures that were drained and are not committed
+        self._unstored = 0  # captures that are drained but not committed
         self._troubles: dict[str, str] = {}
         self._board = StatusBoard(clock, expected)
         self._clock_watch = clock_watch
@@ -124,7 +125,7 @@ class Acquisition:
     # ---- live ------------------------------------------------------------------------------------------------------
 
     def start(self) -> None:
-        """Go live; what a run before this one left undecoded is decoded first, beside capturing."""
+        """Start capturing; captures that an earlier run left undecoded are decoded first, at the same time."""
         self._recall()
         self._last_cycle_ns = self._clock.monotonic_ns()
         for intake in self._intakes:
@@ -133,16 +134,16 @@ class Acquisition:
         self._writer.start()
 
     def stop(self, budget: TimeBudget | None = None) -> bool:
-        """Stop the links, store all that they have captured, decode what time allows. Harmless when not started.
+        """Stop the links, store all their captures, and decode as many as time allows. Harmless when not started.
 
-        Raw captures come first; what is not decoded after half of the time is left to the next start.
+        Raw captures are stored first. Captures not decoded after half of the time are left to the next start.
 
         Args:
-            budget: how long it may take, `STOP_S` by default. What is not stored by then is counted, and the log and
-                `check` tell.
+            budget: time limit, `STOP_S` by default. Captures not stored by then are counted, logged and reported by
+                `check`.
 
         Returns:
-            whether the writer has ended: where it hangs in a commit, it has the store for itself.
+            True if the writer has ended; False if it hangs in a commit and still holds the store.
         """
         budget = budget or TimeBudget(STOP_S)
         self._stop_links.set()
@@ -155,12 +156,12 @@ class Acquisition:
             return True
         self._writer.join(budget.left_s)
         if self._writer.is_alive():
-            log.critical("%s: a write does not end; it is left behind", self._store.path)
+            log.critical("%s: a write does not finish; stopping without it", self._store.path)
         lost = self._unstored + sum(intake.unstored for intake in self._intakes)
         if lost:
-            self._give_up(f"{lost} captures could not be stored before the end")
+            self._give_up(f"{lost} captures could not be stored before the shutdown")
         elif self._decoded is not None or not self._backlog.is_empty:
-            log.warning("all captures are stored; those that there was no time to decode, the next start decodes")
+            log.warning("all captures are stored; the next start decodes those that are not decoded yet")
         return not self._writer.is_alive()
 
     def _give_up(self, why: str) -> None:
@@ -168,32 +169,32 @@ class Acquisition:
         self._failure = AcquisitionError(why)
 
     def status(self) -> AcquisitionStatus:
-        """A snapshot, from any thread."""
+        """Return a snapshot; may be called from any thread."""
         summaries = self._decoding.summaries(self._clock.now())
         state = self._board.snapshot(self._intakes, summaries, self._decoding.defects(), is_behind=self.is_behind)
         return replace(state, is_write_hung=self._writer is not None and not self.alive(WRITE_HUNG_S))
 
     @property
     def is_behind(self) -> bool:
-        """True while captures wait in the store to be decoded, as after a kill: readings and fixes come late."""
+        """True while captures wait in the store to be decoded, as after a kill: readings and fixes are late."""
         return self._backlog.is_behind
 
     def check(self) -> None:
-        """Raise if acquisition has failed; a disk that is full or slow is no reason to, it is waited for.
+        """Raise if acquisition has failed; a full or slow disk is not a failure, because writes are retried.
 
         Raises:
-            AcquisitionError: the writer has ended by itself, or captures were given up when stopping.
+            AcquisitionError: the writer has ended by itself, or captures were discarded when stopping.
         """
         if self._failure is not None:
             raise AcquisitionError(f"nothing is stored any more: {self._failure}")
 
     @property
     def has_stored_all(self) -> bool:
-        """False once captures were lost because the store could not be written to."""
+        """False once captures were lost because the store could not be written."""
         return self._failure is None
 
     def alive(self, within_s: float) -> bool:
-        """Return True if the writer has gone round within the last real `within_s`; a hung or a dead one has not."""
+        """Return True if the writer is alive and has completed a cycle within the last `within_s` real seconds."""
         since_s = (self._clock.monotonic_ns() - self._last_cycle_ns) / NS_PER_S
         return self._writer is not None and self._writer.is_alive() and self._clock.real_seconds(since_s) <= within_s
 
@@ -223,15 +224,15 @@ class Acquisition:
             self._failure = error
 
     def _note_alive(self, read_until: Stamp) -> None:
-        self._try("its sign of life", partial(self._store.note_alive, read_until))
+        self._try("the heartbeat", partial(self._store.note_alive, read_until))
 
     def _take_in(self, now: Stamp) -> Stamp:
-        """Commit what the links have captured, however long the disk is full or faulty; meanwhile captures queue.
+        """Commit the links' captures, and wait while the disk is full or faulty; captures queue meanwhile.
 
         Returns:
-            Until when all that their ports received is committed, or its loss is.
+            Instant up to which all data received by the ports, or their loss, are committed.
         """
-        links = [intake.read_until for intake in self._intakes]  # asked before the queues are drained
+        links = [intake.read_until for intake in self._intakes]  # read before the queues are drained
         read_until = min([now, *filter(None, links)], key=lambda stamp: stamp.monotonic_ns)
         queues = [intake.drain() for intake in self._intakes]
         if self._clock_watch is not None and (step := self._clock_watch.look(self._clock.now())) is not None:
@@ -251,29 +252,29 @@ class Acquisition:
         return read_until
 
     def _decode_next(self, now: Stamp) -> bool:
-        """Decode one batch and the time that has passed, if that is all, and store what comes of it.
+        """Decode one batch, and pass the time to the decoders if no batch is left; store the records.
 
         Returns:
-            False where the disk refuses, and it is to be tried again.
+            False if the disk refuses, and the call must be repeated.
         """
-        if self._decoded is None and not self._try("what is decoded", partial(self._decode, now)):
+        if self._decoded is None and not self._try("decoded records", partial(self._decode, now)):
             return False
         decoded = self._decoded
         if decoded is None:
             return True
         if (decoded.records or decoded.chunk_ids) and not self._try(
-            "what is decoded", partial(self._commit_records, decoded.records, decoded.chunk_ids)
+            "decoded records", partial(self._commit_records, decoded.records, decoded.chunk_ids)
         ):
             return False
         self._decoded = None
-        # What an earlier run left over says nothing of how things are now.
+        # Records of an earlier run do not show the present state.
         hand_on = self._pass_on if self._is_left_over else self._hand_on
         hand_on([*decoded.reports, *decoded.records])
         return True
 
     def _decode(self, now: Stamp) -> None:
         batch = self._backlog.next()
-        # Time passes for decoders only once they have been given all that was captured in it.
+        # Decoders are told the time only after they have been given all captures up to it.
         is_tick = self._backlog.is_empty and now.monotonic_ns >= self._next_tick_ns
         if batch is None and not is_tick:
             return
@@ -290,18 +291,18 @@ class Acquisition:
     def _tell_of_left_overs(self, *, is_left_over: bool) -> None:
         self._is_left_over = is_left_over
         if is_left_over:
-            log.warning("captures that the last run left undecoded are being decoded")
+            log.warning("decoding captures that the last run left undecoded")
         else:
-            self._decoding = self._new_decoding()  # what was left over is decoded apart from what comes live
+            self._decoding = self._new_decoding()  # live captures are decoded separately from those left over
             self._recall()
-            log.info("what the last run left is decoded")
+            log.info("all captures of the last run are decoded")
 
     def _new_decoding(self) -> LinkDecoders:
-        """Return decoders that go on from what devices have told of their state."""
+        """Return decoders that start from the stored states of the devices."""
         return LinkDecoders(self._factories, self._states)
 
     def _recall(self) -> None:
-        """Have decoders go on from what devices have told of their state before this run, and show it."""
+        """Start the decoders from the devices' states before this run, and show these states."""
         self._board.recall(self._decoding.begin(self._clock.now()))
 
     def _states(self, before: Stamp) -> Sequence[DeviceEvent]:
@@ -310,12 +311,12 @@ class Acquisition:
     # ---- replay ----------------------------------------------------------------------------------------------------
 
     def run_inline(self, items: Iterable[LinkItem]) -> None:
-        """Store and decode `items`, in order, as fast as it goes, in this thread.
+        """Store and decode `items`, in order, as fast as possible, in this thread.
 
-        Time is what the captures' stamps say, so the same items give the same rows, whatever the machine does.
+        Time is taken from the captures' stamps, so that the same items always give the same rows.
 
         Raises:
-            sqlite3.Error, StoreError: the store cannot be written to.
+            sqlite3.Error, StoreError: the store cannot be written.
         """
         batch: list[LinkItem] = []
         starts_ns = 0
@@ -362,7 +363,7 @@ class Acquisition:
             self._store.mark_decoded(chunk_ids)
 
     def _insert(self, records: Sequence[Record]) -> None:
-        """Insert records; one that the store refuses must not keep the others out, nor come again at every start."""
+        """Insert records; a record that the store refuses is replaced by a decode failure and blocks no others."""
         try:
             self._store.insert_records(records)
         except _REFUSED as error:
@@ -383,10 +384,10 @@ class Acquisition:
             self._on_records(records)
         except Exception:
             # The records are stored; a fault of their consumer must not end acquisition.
-            log.exception("records are stored, but could not be handed on")
+            log.exception("records are stored, but could not be processed further")
 
     def _insist(self, work: Callable[[], T]) -> T:
-        """Do `work` and return its result, however long the disk is full or faulty; when stopping, only a few times."""
+        """Repeat `work` until the disk accepts it, and return its result; when stopping, retry only a few times."""
         tries_left = LAST_RETRIES
         while True:
             try:
@@ -404,7 +405,7 @@ class Acquisition:
                 return result
 
     def _try(self, what: str, work: Callable[[], None]) -> bool:
-        """Return True if the disk lets `work` be done; where it does not, captures are stored first, if they can be."""
+        """Try `work` once and return True if the disk accepts it; otherwise captures are stored before a retry."""
         try:
             work()
         except sqlite3.DatabaseError as error:
@@ -421,14 +422,14 @@ class Acquisition:
         else:
             sentence = storage_sentence(self._store.path, error)
             if what not in self._troubles:
-                log.error("%s cannot be written and wait to be tried again: %s", what, sentence)
+                log.error("%s cannot be written; retrying: %s", what, sentence)
             self._troubles[what] = sentence
         self._board.set_error(next(iter(self._troubles.values()), None))
 
 
 @dataclass(frozen=True)
 class _Decoded:
-    """A batch, decoded, that is not stored yet: its chunks, what links told beside it, and its records."""
+    """A decoded batch that is not stored yet: its chunks, the reports of its links, and its records."""
 
     chunk_ids: Sequence[int]
     reports: Sequence[Record]
@@ -436,7 +437,7 @@ class _Decoded:
 
 
 def _in_time_order(queues: Iterable[Sequence[LinkItem]]) -> list[LinkItem]:
-    """Items of all links by their instants, so that a batch holds one time of all; a link's own stay in order."""
+    """Return the items of all links in order of time, so that a batch covers one period; each link's order is kept."""
 
     def keyed(items: Sequence[LinkItem]) -> Iterator[tuple[int, LinkItem]]:
         newest_ns = -(2**63)
@@ -448,7 +449,7 @@ def _in_time_order(queues: Iterable[Sequence[LinkItem]]) -> list[LinkItem]:
 
 
 def _tell_of_links(reports: Iterable[Record]) -> None:
-    """A rig that is silent must say why in the service's journal, where people look first."""
+    """Log the state of links, so that the service's journal shows why a rig is silent."""
     for report in reports:
         if isinstance(report, DeviceEvent) and report.kind in _LINK_LEVELS:
             log.log(_LINK_LEVELS[report.kind], "%s", report.text)

@@ -1,8 +1,8 @@
 """Captures that are stored and wait to be decoded.
 
-The store's `undecoded_chunks` is the whole of it, so a stop, a kill or a slow decoder loses nothing. What came last is
-kept in memory too, which spares reading it back; what a run before this one left, and what is more than memory should
-hold, is read from the store.
+The store's `undecoded_chunks` lists all of them, so a stop, a kill or a slow decoder loses nothing. The newest captures
+are also kept in memory, which saves reading them back. Captures left by an earlier run, and captures beyond the limit
+of the memory, are read from the store.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from daemon.store import Store, StoreError
 from drivers.clock import Clock
 from drivers.readings import Capture, DecodeFailure, Record
 
-BATCH_CAPTURES = 4096  # decoded and stored at once, so that a stop and the watchdog need not wait for more
-HELD_CAPTURES = 50_000
+BATCH_CAPTURES = 4096  # most captures decoded and stored at once; a stop and the watchdog wait for one batch
+HELD_CAPTURES = 50_000  # most captures held in memory
 
 
 @dataclass(frozen=True)
@@ -25,10 +25,10 @@ class Batch:
 
     Attributes:
         chunk_ids: the chunks that hold them.
-        captures: all of them, each link's in order.
-        reports: what the links told beside them, which is stored already.
-        failures: chunks among them that cannot be read.
-        is_left_over: a run before this one captured them.
+        captures: their captures, each link's in order.
+        reports: records that the links themselves reported at the same time; already stored.
+        failures: failures of chunks that cannot be read.
+        is_left_over: an earlier run captured them.
     """
 
     chunk_ids: Sequence[int]
@@ -39,34 +39,34 @@ class Batch:
 
 
 class Backlog:
-    """Captures that wait to be decoded, oldest first. Belongs to the writer's thread.
+    """Captures that wait to be decoded, oldest first. For the writer thread only.
 
     Args:
-        store: where the captures are.
-        clock: for when a chunk was found to be damaged.
+        store: store of the captures.
+        clock: clock for the instants at which chunks are found to be damaged.
     """
 
     def __init__(self, store: Store, clock: Clock) -> None:
         self._store, self._clock = store, clock
         self._batches: deque[Batch] = deque()
         self._held = 0
-        self._reports: list[Record] = []  # of batches that memory does not hold
-        self._last_id = 0  # chunks up to this one have been given out
+        self._reports: list[Record] = []  # reports of batches that are not in memory
+        self._last_id = 0  # chunks up to this id have been returned
         self._left_over_until = store.newest_undecoded()
         self._is_in_store = self._left_over_until > 0
 
     @property
     def is_behind(self) -> bool:
-        """True while some of it is in the store alone."""
+        """True while some captures are in the store only."""
         return self._is_in_store
 
     @property
     def is_empty(self) -> bool:
-        """True when all that was stored has been given out."""
+        """True when all stored captures have been returned."""
         return not self._batches and not self._is_in_store
 
     def add(self, batch: Batch) -> None:
-        """A batch that has been stored waits behind all others."""
+        """Add a stored batch behind all others."""
         if self._is_in_store or self._held + len(batch.captures) > HELD_CAPTURES:
             self._is_in_store = True
             self._reports += batch.reports
@@ -75,10 +75,10 @@ class Backlog:
         self._held += len(batch.captures)
 
     def next(self) -> Batch | None:
-        """Take the oldest batch out; None when there is none.
+        """Remove and return the oldest batch; None if there is none.
 
         Raises:
-            sqlite3.OperationalError: the disk does not give it at present.
+            sqlite3.OperationalError: the disk cannot be read at present.
         """
         if self._batches:
             batch = self._batches.popleft()
@@ -107,5 +107,5 @@ class Backlog:
                 captures += self._store.chunk_captures(chunk_id)
             except StoreError as error:
                 failures.append(DecodeFailure("store", self._clock.now(), str(error), b""))
-        # What links told is news of now: it goes with what was captured now, after all that was left over.
+        # Reports of links are current: they are returned with the current captures, after all that were left over.
         return Batch(ids, captures, () if ids else tuple(self._reports), failures, is_left_over)

@@ -1,4 +1,4 @@
-"""DBC and EDS files that a rig names: read once, and what they say of its channels told in the rig that is recorded."""
+"""DBC and EDS files named by a rig: read once, and their decoding of its channels added to the recorded rig."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from drivers.can.dbc import DbcFile
 from drivers.can.raw_signal import SignalChannel
 from drivers.canopen.pdo import TransmitPdo
 
-# What the devices map to their TPDO1 by default (the rig file names an EDS for others): index, sub-index, bits.
+# Default mapping of the devices' TPDO1 (for other mappings the rig file names an EDS): index, sub-index, bits.
 _USUAL_MAPPING = {0x6004: 0x60040020, 0x6020: 0x60200120, 0x6130: 0x61300120, 0x7130: 0x71300110, 0x9130: 0x91300120}
 
 CanopenChannel = Cia406Encoder | Cia406Linear | Cia404Analogue
@@ -21,12 +21,12 @@ CanopenChannel = Cia406Encoder | Cia406Linear | Cia404Analogue
 
 @dataclass(frozen=True)
 class ChannelFiles:
-    """The content of a rig's DBC and EDS files, as far as its channels are concerned.
+    """The content of a rig's DBC and EDS files that concerns its channels.
 
     Attributes:
         signals: channel -> signal of its DBC file.
-        pdos: channel -> TPDO of its CANopen device: that of its EDS file, else the usual one.
-        decoding: channel that names a file -> how that decodes its value, see `Rig.decoding`.
+        pdos: channel -> TPDO of its CANopen device: from its EDS file, or else the default one.
+        decoding: channel that names a file -> how the file decodes its value, see `Rig.decoding`.
     """
 
     signals: Mapping[str, SignalChannel]
@@ -38,11 +38,12 @@ class ChannelFiles:
         """Read the files.
 
         Args:
-            rig: whose channels.
-            directory: where its DBC and EDS files are.
+            rig: the rig.
+            directory: directory of its DBC and EDS files.
 
         Raises:
-            DescriptionError: a DBC or EDS file is missing, malformed, or lacks what a channel names.
+            DescriptionError: a DBC or EDS file is missing, malformed, or lacks a message, signal or object that a
+                channel names.
         """
         opened: dict[str, DbcFile] = {}
         signals: dict[str, SignalChannel] = {}
@@ -62,7 +63,7 @@ class ChannelFiles:
 
 
 def with_files(source: RigSource) -> tuple[RigSource, ChannelFiles]:
-    """Read the DBC and EDS files of a rig; returns it with the decoding that they give its channels, and the files.
+    """Read the DBC and EDS files of a rig; return the rig with their decoding of its channels, and the files.
 
     Raises:
         DescriptionError: as `ChannelFiles.read`.

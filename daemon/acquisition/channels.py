@@ -1,4 +1,4 @@
-"""A rig's channels as the drivers' decoders and device set-ups: the rig file says what, the drivers know how."""
+"""Decoders and device set-ups of the drivers for a rig's channels, as described by the rig file."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from drivers.errors import DescriptionError
 
 
 def decoder_factories(rig: Rig, files: ChannelFiles, link: str) -> list[Callable[[], ChannelDecoder]]:
-    """Return for each channel of a link a function that makes a fresh decoder of it.
+    """Return, for each channel of a link, a function that makes a fresh decoder.
 
     Args:
-        rig: whose channels.
+        rig: the rig.
         files: the rig's DBC and EDS files.
         link: name of the CAN link.
 
@@ -33,7 +33,13 @@ def decoder_factories(rig: Rig, files: ChannelFiles, link: str) -> list[Callable
 
 
 def node_setups(rig: Rig, files: ChannelFiles, link: str) -> list[NodeSetup]:
-    """Settings that active set-up expects of each CANopen node of a link, and writes to it."""
+    """Return the settings that active set-up checks and writes in each CANopen node of a link.
+
+    Args:
+        rig: the rig.
+        files: the rig's DBC and EDS files.
+        link: name of the CAN link.
+    """
     return [
         NodeSetup(
             node=channel.node,
@@ -142,5 +148,5 @@ def _bit_field(channel: RawSignal) -> BitField:
 
 
 def _max_rate(rig: Rig, name: str) -> float | None:
-    """The joint's fastest motion; None for a channel that is no joint, whose jumps are not looked for."""
+    """Return the joint's greatest rate; None for a channel that is not a joint, whose jumps are not detected."""
     return rig.joint(name).max_rate if name in rig.joint_names else None

@@ -1,10 +1,10 @@
 """Joins each fix with the joints at its own instant: a pure state machine over records.
 
 A fix was measured `link_delay_s` before the first byte of its record arrived. Every joint is interpolated linearly
-between the two samples around that instant, on the monotonic clock; a fix therefore waits until every joint has been
-sampled a little beyond it, or other joints `deadline_s` beyond it. Time is what the records say: links may be read
-late, one later than another, and a log is joined as what came live. Beside the joints' values a joined fix carries what
-effects depend on: direction of approach, rate, dwell, and the latest signals.
+between the two samples around that instant, on the monotonic clock. A fix therefore waits until every joint has been
+sampled shortly after it, or some joint `deadline_s` after it. Time is taken from the records: links may be read late,
+one later than another, and a log is joined like live data. In addition to the joints' values a joined fix has the
+quantities on which effects depend: direction of approach, rate, dwell, and the latest signals.
 """
 
 from __future__ import annotations
@@ -31,15 +31,15 @@ from drivers.readings import DeviceEvent, EventKind, Fix, Reading, Record, Statu
 
 @dataclass(frozen=True)
 class JoinedFix:
-    """A fix with all that is known of the machine at its instant.
+    """A fix with the state of the machine at its instant.
 
     Attributes:
-        fix: as the station gave it.
-        stamp: when it was measured: the fix's stamp with the link delay taken off.
+        fix: the fix as measured by the station.
+        stamp: when it was measured: the fix's stamp minus the link delay.
         values: observations CSV column -> number (`theta1_deg`, `theta1_dir`, `theta1_rate`, `boom_valve_mA`, ...).
-        dwell_s: since the last motion of any joint, or since the joints were first seen; None before they were.
-        standstill: number of the standstill, rising with each; None while the boom moves or has not yet settled.
-        refused: why calibration must not use it, in words; "" when it may.
+        dwell_s: time since the last motion of any joint, or since the joints' first readings; None before these.
+        standstill: number of the standstill, increasing; None while the boom moves or has not yet settled.
+        refused: why calibration must not use it, a clause; "" if it may.
     """
 
     fix: Fix
@@ -50,7 +50,7 @@ class JoinedFix:
     refused: str = ""
 
     def columns(self) -> dict[str, float]:
-        """`values` with `dwell_s`: the numeric columns of the observations CSV, apart from the position."""
+        """Return `values` with `dwell_s`: the numeric columns of the observations CSV without the position."""
         return {**self.values, **({} if self.dwell_s is None else {"dwell_s": self.dwell_s})}
 
 
@@ -60,10 +60,10 @@ class MachineState:
 
     Attributes:
         monotonic_ns: that instant.
-        boot_id: which boot `monotonic_ns` belongs to.
-        oldest: the joint that was last read then; the others were read then or later.
-        values: observations CSV column -> number, as of a JoinedFix.
-        dwell_s: as of a JoinedFix.
+        boot_id: boot to which `monotonic_ns` belongs.
+        oldest: joint whose newest reading is oldest; the others were read at that instant or later.
+        values: observations CSV column -> number, as in a JoinedFix.
+        dwell_s: as in a JoinedFix.
     """
 
     monotonic_ns: int
@@ -74,10 +74,10 @@ class MachineState:
 
 
 def joint_inputs(rig: Rig) -> list[JointInput]:
-    """The joints of a rig, for an ObservationJoiner.
+    """Return the joints of a rig, for an ObservationJoiner.
 
-    A joint moves when it changes by six standard deviations and three steps of its reading. Two samples of three may
-    be missing around a fix, and of a fast channel a quarter of a second.
+    A joint counts as moving when it changes by at least six standard deviations and three steps of its reading. Around
+    a fix two of three samples may be missing, and for a fast channel a quarter of a second.
     """
     period_s = {c.name: c.period_ms / 1000 for c in rig.channels if isinstance(c, Cia406Encoder | Cia406Linear)}
     return [
@@ -87,7 +87,7 @@ def joint_inputs(rig: Rig) -> list[JointInput]:
 
 
 def signal_inputs(rig: Rig) -> list[SignalInput]:
-    """The signals of a rig: its channels that are no joints."""
+    """Return the signals of a rig: its channels that are not joints."""
     return [SignalInput(c.name, c.column) for c in rig.channels if c.name not in rig.joint_names]
 
 
@@ -95,15 +95,15 @@ class ObservationJoiner:
     """Joins fixes with joints and signals.
 
     Args:
-        joints: every joint that a fix needs.
-        signals: what is carried along where it is fresh.
-        link_delay_s: station -> how long before the first byte of its record it measured; 0 where not given.
-        settle_s: how long the boom must have stood for a fix to belong to a standstill.
-        deadline_s: how long a fix waits for joints that have fallen silent; where all are silent, it waits as long as
+        joints: all joints that a fix needs.
+        signals: signals that are added to a fix if they are fresh.
+        link_delay_s: station -> time from a measurement to the first byte of its record; 0 where not given.
+        settle_s: how long the boom must have been still for a fix to belong to a standstill.
+        deadline_s: how long a fix waits for joints that have fallen silent; if all are silent, it waits as long as
             samples are kept.
 
     Attributes:
-        refusals: reason -> how many fixes were refused for it.
+        refusals: reason -> number of fixes refused for it.
     """
 
     def __init__(
@@ -126,11 +126,11 @@ class ObservationJoiner:
         self._newest_ns = 0
 
     def feed(self, records: Iterable[Record]) -> list[JoinedFix]:
-        """Take records and return the fixes that they complete, refused ones included.
+        """Add records and return the fixes that they complete, refused fixes included.
 
-        The records of one call may be in any order, and those of a link may come calls after those of another. Fixes
-        whose own status is not OK are passed over, and so are readings of doubtful time: they tell nothing of any
-        instant. Records of another boot end what was pending.
+        The records of one call may be in any order, and records of one link may be given several calls later than those
+        of another. Fixes whose own status is not OK are skipped, and so are readings of doubtful time, which belong to
+        no known instant. Records of a new boot complete all pending fixes.
         """
         done: list[JoinedFix] = []
         timed = [(r.stamp, r) for r in records if isinstance(r, Reading | Fix | DeviceEvent)]
@@ -148,7 +148,7 @@ class ObservationJoiner:
         return done
 
     def latest(self) -> MachineState | str:
-        """The machine at the newest instant at which every joint is known, or why there is none."""
+        """Return the machine's state at the newest instant at which every joint is known, or why there is none."""
         last = min(self._joints.values(), key=lambda joint: joint.newest_ns)
         if last.newest_ns < 0:
             return f"{last.name}: no reading yet"
@@ -158,7 +158,7 @@ class ObservationJoiner:
         return MachineState(last.newest_ns, self._boot_id, last.name, values, self._motion.at(last.newest_ns)[0])
 
     def _restart(self, boot_id: str) -> list[JoinedFix]:
-        """Another boot, another monotonic clock: nothing of the one before can be compared with it."""
+        """Discard all samples for a new boot, whose monotonic clock cannot be compared with the previous one's."""
         ended = [self._join(fix, stamp) for fix, stamp in self._pending]
         self._pending.clear()
         for joint in self._joints.values():
@@ -206,7 +206,7 @@ class ObservationJoiner:
         return JoinedFix(fix, stamp, values, dwell_s, standstill, refused)
 
     def _values(self, at_ns: int, of: str) -> tuple[dict[str, float], str]:
-        """Columns of joints and signals at an instant, and why a joint is missing among them; "" if none is."""
+        """Return the columns of joints and signals at an instant, and why a joint is missing; "" if none is."""
         values: dict[str, float] = {}
         missing = ""
         for joint in self._joints.values():

@@ -1,4 +1,4 @@
-"""The decoders of all links: captures in, records out; a decoder that fails ends neither the others nor acquisition."""
+"""The decoders of all links, from captures to records; a failing decoder stops neither the others nor acquisition."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ class LinkDecoders:
     """The decoders of all links, each within one boot.
 
     Args:
-        factories: link -> what makes its decoder; captures of other links yield nothing.
-        recalled: returns what devices have told of their state before an instant, in its boot: a decoder that is made
-            then goes on from there.
+        factories: link -> function that makes its decoder; captures of other links are ignored.
+        recalled: returns the events that describe the devices' states before an instant, in its boot; a new decoder
+            starts from these states.
     """
 
     def __init__(
@@ -36,7 +36,7 @@ class LinkDecoders:
         self._ticked_ns = -TICK_NS
 
     def feed(self, captures: Sequence[Capture]) -> list[Record]:
-        """Records of captures, in their order."""
+        """Decode captures, and return their records in order."""
         records: list[Record] = []
         link = boot = None
         decoder: Decoder | None = None
@@ -55,7 +55,7 @@ class LinkDecoders:
         return records
 
     def feed_and_tick(self, captures: Sequence[Capture]) -> list[Record]:
-        """Records of captures and of the time that passes by their stamps."""
+        """Decode captures, and return their records and those caused by the passing of time in their stamps."""
         records: list[Record] = []
         start = 0
         for i, capture in enumerate(captures):
@@ -66,7 +66,7 @@ class LinkDecoders:
         return records + self.feed(captures[start:])
 
     def tick(self, now: Stamp) -> list[Record]:
-        """Records that time causes, at decoders that live in the boot of `now`."""
+        """Tell the time to the decoders of the boot of `now`, and return the records that it causes."""
         records: list[Record] = []
         for link in self._factories:
             if self._boots.setdefault(link, now.boot_id) != now.boot_id:
@@ -78,23 +78,23 @@ class LinkDecoders:
         return records
 
     def summaries(self, now: Stamp) -> list[CanSummary]:
-        """Return the frames that CAN links have heard until `now`; from any thread."""
+        """Return the frames that CAN links have received until `now`; may be called from any thread."""
         decoders = [self._decoders.get(link) for link in self._factories]
         return [decoder.summary(now) for decoder in decoders if isinstance(decoder, CanDecoder)]
 
     def defects(self) -> dict[str, Stamp]:
-        """Link -> when its decoder last showed a defect of its own; from any thread."""
+        """Return link -> when its decoder last failed by an internal error; may be called from any thread."""
         return dict(self._defects)
 
     def _failure(self, link: str, stamp: Stamp, error: Exception, raw: bytes) -> DecodeFailure:
-        """A decoder promises never to raise; a defect in one must not end acquisition, nor flood the log."""
+        """Return the failure of a defective decoder; a decoder should never raise. Only the first failure is logged."""
         if link not in self._defects:
-            log.critical("link %s: its decoder is defective; captures are kept", link, exc_info=error)
+            log.critical("link %s: its decoder failed; captures are kept", link, exc_info=error)
         self._defects[link] = stamp
         return DecodeFailure(link, stamp, f"the decoder failed: {type(error).__name__}: {error}", raw)
 
     def begin(self, at: Stamp) -> list[DeviceEvent]:
-        """Make the decoders of all links; return what they take on of what devices have told before that instant."""
+        """Make the decoders of all links, and return the events before that instant from which they start."""
         return [event for link in self._factories for event in self._make(link, at)]
 
     def _decoder(self, link: str, at: Stamp) -> Decoder:

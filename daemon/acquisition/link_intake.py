@@ -1,6 +1,6 @@
-"""One link's thread and the bounded queue behind it: what does not fit is counted, and the loss is a record.
+"""One link's thread and its bounded queue; captures that do not fit are counted, and the loss is recorded.
 
-So is what the bus carried before the link was open: a run begins some time before its ports are.
+The time from the start of the run until the link's port is open is recorded as a gap.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ from drivers.readings import (
 log = logging.getLogger(__name__)
 
 RESTART_S = 1.0
-LEFT_BEHIND_S = 10.0  # real seconds for which a link is waited for
-_LEFT_BEHIND_NS = 2 * NS_PER_S  # at least, where time runs slowly: links tell once a second how far they have read
+LEFT_BEHIND_S = 10.0  # real seconds without reading after which a gap is recorded
+_LEFT_BEHIND_NS = 2 * NS_PER_S  # shortest wait where time runs slowly: links update `read_until` once a second
 
 
 @dataclass(slots=True)
 class _Loss:
-    """Captures that found the queue full since it was last drained."""
+    """Captures lost since the queue was last drained, because it was full."""
 
     count: int
     first: Stamp
@@ -40,14 +40,14 @@ class _Loss:
 
 
 class LinkIntake:
-    """Runs a link loop in a thread of its own, again if it dies, and queues what it emits.
+    """Runs a link loop in its own thread, restarts it if it ends, and queues the items that it emits.
 
     Args:
         loop: the link.
-        clock: for the restart's delay and stamp.
-        limit: captures that may wait; events and gaps, being few, are always taken.
-        begun: when the run began; nothing is known of the link from then until its loop first tells of its port. So it
-            is from the end of a loop that died.
+        clock: clock for the delay and the stamp of a restart.
+        limit: largest number of queued captures; events and gaps, being few, are always queued.
+        begun: start of the run. From then, and from the end of a loop that ended, nothing is known of the link until
+            its loop first reports the state of its port.
     """
 
     def __init__(self, loop: LinkLoop, clock: Clock, limit: int, begun: Stamp) -> None:
@@ -55,8 +55,8 @@ class LinkIntake:
         self.dropped = 0
         self.restarts = 0
         self._loop, self._clock, self._limit = loop, clock, limit
-        self._begun: Stamp | None = begun  # until the loop's first word
-        self._behind: Stamp | None = None  # since when the link is not read, where that is told
+        self._begun: Stamp | None = begun  # until the loop's first report
+        self._behind: Stamp | None = None  # start of the recorded gap in which the link is not read
         self._behind_lock = threading.Lock()
         # Appends and pops of a deque are atomic: one thread emits, one drains, and only the loss needs a lock.
         self._queue: deque[LinkItem] = deque()
@@ -70,22 +70,22 @@ class LinkIntake:
         self._thread.start()
 
     def join(self, timeout_s: float) -> None:
-        """Wait at most that long for the thread's end, after `stop` was set."""
+        """Wait for the thread's end for at most `timeout_s` seconds, after `stop` was set."""
         if self._thread is not None:
             self._thread.join(timeout_s)
             if self._thread.is_alive():
-                log.error("link %s did not stop within %.1f s; it is left behind", self.name, timeout_s)
+                log.error("link %s did not stop within %.1f s; stopping without it", self.name, timeout_s)
 
     @property
     def queued(self) -> int:
-        """Number of items that wait."""
+        """Number of queued items."""
         return len(self._queue)
 
     @property
     def read_until(self) -> Stamp | None:
-        """All that the link's port had received by then is queued, or its loss is told.
+        """Instant up to which all data received by the link's port are queued, or their loss is recorded.
 
-        None where nothing waits, and where a gap says already that the link is not read.
+        None if there is no limit, or if an open gap already records that the link is not read.
         """
         until = self._unread_since()
         return None if until == self._behind else until
@@ -96,23 +96,23 @@ class LinkIntake:
 
     @property
     def unstored(self) -> int:
-        """Number of captures that wait, or found the queue full and are not told yet."""
+        """Number of queued captures, and of lost captures that are not recorded yet."""
         waiting = sum(isinstance(item, CanCapture | SerialCapture) for item in self._queue.copy())
         loss = self._loss
         return waiting + (loss.count if loss is not None else 0)
 
     def drain(self) -> list[LinkItem]:
-        """Return the items that wait, oldest first, and at their end a gap for those that were lost.
+        """Return the queued items, oldest first, followed by a gap for lost captures.
 
-        A link that has not been read for long, as its loop hangs or dies again and again, gets a gap of its own.
+        A link that has not been read for long, because its loop hangs or ends repeatedly, gets a gap as well.
         """
         queue = self._queue
-        items: list[LinkItem] = self._left_behind()  # before what the loop's first word says of the same gap
+        items: list[LinkItem] = self._left_behind()  # before the loop's first report, which concerns the same gap
         items += [queue.popleft() for _ in range(len(queue))]
         if self._loss is not None:
             with self._loss_lock:
                 loss, self._loss = self._loss, None
-            text = f"{loss.count} captures lost: the queue to the store is full; is the disk full, or too slow?"
+            text = f"{loss.count} captures lost: the queue to the store was full; check if the disk is full or too slow"
             items.append(DeviceEvent(self.name, loss.last, EventKind.FRAMES_DROPPED, text, loss.count))
             items.append(Gap(self.name, GapReason.FRAMES_LOST, loss.first, loss.last, loss.count))
         return items
@@ -127,7 +127,7 @@ class LinkIntake:
                 return []
             until = self._loop.read_until
             if until is not None and until.since(since) > 0:
-                return []  # it is read, and its first word is to come, which a log may say late
+                return []  # the link is read, and its first report, which may be late in a log, is still to come
             waited_ns = now.since(since)
             if waited_ns < _LEFT_BEHIND_NS or self._clock.real_seconds(waited_ns / NS_PER_S) < LEFT_BEHIND_S:
                 return []
@@ -135,7 +135,7 @@ class LinkIntake:
             return [Gap(self.name, GapReason.LINK_DOWN, since)]
 
     def _end_of_start(self, begun: Stamp, item: LinkItem) -> None:
-        """Tell of the time from the start of the run, or from the end of a loop that died, until the port is open."""
+        """Record a gap from the start of the run, or from the end of a loop that ended, until the port is open."""
         with self._behind_lock:
             is_told = self._behind == begun
             first = _first_word(item) or (stamp_of(item) if is_told else None)
@@ -168,7 +168,7 @@ class LinkIntake:
                 reason = f"{type(error).__name__}: {error}"
             if not stop.is_set():
                 self.restarts += 1
-                text = f"{self.name}: the link's loop ended ({reason}); it is started again in {RESTART_S:g} s"
+                text = f"{self.name}: the loop that reads the link ended ({reason}); restarting it in {RESTART_S:g} s"
                 now = self._clock.now()
                 self._emit(DeviceEvent(self.name, now, EventKind.LINK_LOST, text))
                 self._begun = self._loop.read_until or now
@@ -176,12 +176,12 @@ class LinkIntake:
 
 
 def stamp_of(record: LinkItem | Record) -> Stamp:
-    """Return when a record was made, or a gap began."""
+    """Return the stamp of a record, or the start of a gap."""
     return record.start if isinstance(record, Gap) else record.stamp
 
 
 def _first_word(item: LinkItem) -> Stamp | None:
-    """When a link tells for the first time whether its port is open; None where it just begins, as a replay does."""
+    """Return when a link first reports whether its port is open; None if it starts with other items, as in a replay."""
     if isinstance(item, Gap):
         return item.start if item.reason is GapReason.LINK_DOWN else None
     if isinstance(item, DeviceEvent) and item.kind in (EventKind.LINK_UP, EventKind.LINK_LOST):

@@ -1,4 +1,4 @@
-"""Decodes stored captures again, so that a stretch of time has all its readings and fixes, as a session has them."""
+"""Decodes stored captures again, so that a period has all its readings and fixes, like a session."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from daemon.store.upkeep.full_samples import Stretch, put_again, stretches_betwe
 from drivers.clock import NS_PER_S, Stamp
 from drivers.readings import Capture, Decoder, Fix, Reading
 
-QUERY_NS = 600 * NS_PER_S  # while captures are read, the write-ahead log of the store grows
-SLICE_NS = NS_PER_S  # stored at once: acquisition must not wait for more
+QUERY_NS = 600 * NS_PER_S  # period of one query; while captures are read, the store's write-ahead log grows
+SLICE_NS = NS_PER_S  # period stored at once; acquisition waits for one slice at most
 
 
 def redecode(
@@ -33,24 +33,24 @@ def redecode(
     *,
     may_differ: bool = False,
 ) -> int:
-    """Store every reading and fix that the captures of some stretches of time hold.
+    """Store all readings and fixes decoded from the captures of some periods.
 
-    Decoders begin a minute earlier, so that they know by then what devices say now and then.
+    Decoders start a minute earlier, so that they have received messages that devices send only now and then.
 
     Args:
-        store: open for writing.
-        decoders: link -> what makes its decoder.
-        stretches: of time, each within one boot.
-        go_on: called for each second of captures; what it raises ends the work, and what is stored stays.
-        may_differ: values may be others than those that are stored: the rig file is known to be theirs, and a decoder
-            was wrong.
+        store: the database, open for writing.
+        decoders: link -> function that makes its decoder.
+        stretches: the periods, each within one boot.
+        go_on: called for each second of captures; an exception that it raises ends the work, and stored rows stay.
+        may_differ: decoded values may differ from the stored ones, because the rig file is known to be the same and a
+            decoder was wrong.
 
     Returns:
-        How many readings and fixes there are now that were not there before.
+        Number of readings and fixes added.
 
     Raises:
-        StoreError: a chunk of captures is damaged, or readings that are stored are others than those that are made
-            again; all before it is stored.
+        StoreError: a chunk of captures is damaged, or decoded readings differ from the stored ones; all readings before
+            that are stored.
     """
     added = 0
     with store.reader() as reader:
@@ -69,7 +69,7 @@ def redecode(
 
 
 def _captures(reader: Reader, links: Sequence[str], since: Stamp, until: Stamp) -> Iterator[Capture]:
-    """Captures of all links by their instants; a link's own stay in order."""
+    """Yield the captures of all links in order of time; each link's order is kept."""
     while since.monotonic_ns <= until.monotonic_ns:
         last = min(until, since.shifted(QUERY_NS), key=lambda stamp: stamp.monotonic_ns)
         own = [reader.captures(link, since, last) for link in links]
@@ -95,21 +95,21 @@ def redecode_command(
     arguments: Mapping[str, Any],
     go_on: Callable[[], None],
 ) -> dict[str, Any]:
-    """Make all readings and fixes of a session, or of some time, again from raw captures.
+    """Decode the raw captures of a session, or of a period, again into readings and fixes.
 
-    It ends before the oldest captures that wait to be decoded for the first time.
+    Only captures older than the oldest ones that wait to be decoded for the first time are decoded.
 
     Args:
-        store: open for writing.
-        rig: the rig file that the decoders are of.
-        decoders: link -> what makes its decoder.
+        store: the database, open for writing.
+        rig: the rig of the decoders.
+        decoders: link -> function that makes its decoder.
         arguments: `session`, or `first_utc_ns` and `last_utc_ns`.
-        go_on: called again and again; what it raises ends the work, and what was stored stays.
+        go_on: called repeatedly; an exception that it raises ends the work, and stored rows stay.
 
     Raises:
-        CommandError: there is nothing to decode, all of it waits to be decoded for the first time, or a session in it
-            was recorded with a rig file that gives others.
-        StoreError: as `redecode`, or stored readings are others than those that are made again.
+        CommandError: there is nothing to decode, all captures wait to be decoded for the first time, or a session in
+            the period was recorded with a rig file that gives different readings.
+        StoreError: as for `redecode`.
     """
     with store.reader() as reader:
         if session := arguments.get("session"):
@@ -118,15 +118,15 @@ def redecode_command(
         else:
             first_ns, last_ns = arguments.get("first_utc_ns"), arguments.get("last_utc_ns")
             if not isinstance(first_ns, int) or not isinstance(last_ns, int) or first_ns >= last_ns:
-                raise CommandError("give a session, or a time whose end is later than its begin")
+                raise CommandError("give a session, or a period whose end is later than its start")
             stretches = stretches_between(reader, first_ns, last_ns)
-            what = f"the time from {_text(first_ns)} to {_text(last_ns)}"
+            what = f"the period from {_text(first_ns)} to {_text(last_ns)}"
         if not stretches:
             raise CommandError(f"the store has no captures of {what}; `rigcal session list` shows the sessions")
         wanted, stretches = stretches, decoded_before(reader, stretches, AFTER_NS)
         if not stretches:
             raise CommandError(
-                f"{what} waits to be decoded for the first time; ask again when `rigcal store stats` says that no "
+                f"{what} waits to be decoded for the first time; try again when `rigcal store stats` shows that no "
                 "captures wait"
             )
         may_differ = session is not None
@@ -134,17 +134,17 @@ def redecode_command(
             for row in sessions_between(reader, since, until, store.boot_row(since)):
                 if why := misreading(rig, row["rig_text"], row["prism"]):
                     raise CommandError(
-                        f"session {row['id']} was recorded with another rig file than the one in use: {why}; "
+                        f"session {row['id']} was recorded with a rig file other than the one in use: {why}; "
                         f"{HOW_TO_READ_AGAIN}",
                         REFUSED,
                     )
                 may_differ &= tells_decoding(rig, row["rig_text"])
-    # Outside sessions, and in those of versions that kept no decoding of channels, nothing but the readings themselves
-    # tells which files made them.
+    # Outside sessions, and in sessions of versions that did not store the decoding of channels, only the readings
+    # themselves show with which files they were decoded.
     added = redecode(store, decoders, stretches, go_on, may_differ=may_differ)
     return {
         "added": added,
-        "is_whole": stretches == wanted,  # else what is younger waits to be decoded for the first time
+        "is_whole": stretches == wanted,  # False if newer captures wait to be decoded for the first time
         "stretches": [{"first_utc_ns": first.utc_ns, "last_utc_ns": last.utc_ns} for first, last in stretches],
     }
 

@@ -1,4 +1,4 @@
-"""Devices for the joints of a rig whose file names none, so that it can be simulated behind real protocols."""
+"""Devices for joints without a channel in the rig file, so that the rig can be simulated with real protocols."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ def with_simulated_channels(rig: Rig, text: str) -> str:
 
     Args:
         rig: the machine.
-        text: its file.
+        text: text of its rig file.
 
     Raises:
-        RigError: more joints than CANopen has nodes.
+        RigError: there are more joints than CANopen nodes.
     """
     read = {channel.name for channel in rig.channels}
     taken = {channel.node for channel in rig.channels if isinstance(channel, CanopenChannel)}

@@ -1,7 +1,7 @@
-"""The simulated rig: its process, and the operator's actions of aiming and driving.
+"""The simulated rig: its process, and the operator's actions of aiming the station and driving the boom.
 
-The daemon talks to it over two pseudo-terminals exactly as to a real rig. This module starts and stops the process,
-aims the station at a prism, and drives the boom from pose to pose.
+The daemon communicates with it over two pseudo-terminals exactly as with a real rig. This module starts and stops the
+process, aims the station at a prism, and drives the boom from pose to pose.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from drivers.clock import ScaledClock
 
 log = logging.getLogger(__name__)
 
-BOOM_SPEED = 0.45  # of the joints' greatest rates
-_REFUSES = 2  # exit status of a simulator that was asked for what there is not
+BOOM_SPEED = 0.45  # share of the joints' greatest rates
+_REFUSES = 2  # exit status of a simulator that cannot simulate what was requested
 _ANSWER_S = 60.0
-_HAND_S = 0.02  # how often, in real time, it is looked whether the operator wants the boom elsewhere
-_ENDED = "the simulated rig has ended; stop the daemon, and `rigcal run --sim` starts both again"
-POSES_AHEAD = 30  # drawn at a time, and visited by the short way
+_HAND_S = 0.02  # period, in real time, of checking for new poses from the operator
+_ENDED = "the simulated rig has ended; stop the daemon, and start both again with `rigcal run --sim`"
+POSES_AHEAD = 30  # poses drawn at a time, and visited in order of distance
 
 
 Stop = tuple[Mapping[str, float], float]  # joint -> deg or mm; how long to stand there, s
@@ -40,21 +40,22 @@ class SimulationError(Exception):
 
 
 class SimulatedRig:
-    """A rig simulated by another process, at the speed of a shared clock.
+    """A rig simulated by a separate process, at the speed of a shared clock.
 
     Args:
-        rig: shipped name or path.
+        rig: name of a shipped rig, or path of a rig file.
         rates: joint name -> its greatest rate, deg/s or mm/s.
-        directory: where the ports appear: `can` (an slcan adapter) and `station`.
-        clock: shared with the process; its rate is the simulation's speed.
-        station_delay_s: how old a measurement of the station is when its record starts.
-        seed: of the machine's imperfections, of all noise and of the poses.
-        effects: hidden effects, as the simulator spells them.
-        secret: directory in which the simulator names one more, which it draws; none by default.
+        directory: directory of the ports: `can` (an slcan adapter) and `station`.
+        clock: clock shared with the process; its rate is the simulation's speed.
+        station_delay_s: age of a measurement of the station when its record starts.
+        seed: seed of the machine's imperfections, of all noise and of the poses.
+        effects: hidden effects, in the simulator's notation.
+        secret: directory in which the simulator names one more effect, drawn at random; none by default.
 
     Raises:
-        ConfigError: no such effect, or none that this rig can have; the process has said why on standard error.
-        SimulationError: it does not start.
+        ConfigError: an effect does not exist, or is not possible on this rig; the process has printed the reason on
+            standard error.
+        SimulationError: the process does not start.
     """
 
     def __init__(
@@ -83,7 +84,7 @@ class SimulatedRig:
         command += ["--bus-master", "host", "--signal-ms", "200", "--effects", ",".join(effects)]
         command += ["--latency-ms", str(station_delay_s * 1e3)]
         command += [] if secret is None else ["--secret", str(secret)]
-        # In a session of its own: a Ctrl-C ends the daemon, which ends the rig when it is done with it.
+        # In its own session, so that Ctrl-C ends only the daemon, which then ends the rig.
         self._process = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True
         )
@@ -97,7 +98,7 @@ class SimulatedRig:
         except SimulationError as error:
             self.close()
             if self._process.returncode == _REFUSES:
-                raise ConfigError("the simulated rig refuses what it was asked for, as it says above") from error
+                raise ConfigError("the simulated rig refused its options; the reason is printed above") from error
             raise
 
     def has_ended(self) -> bool:
@@ -109,23 +110,25 @@ class SimulatedRig:
         self._do("aim", "aimed", target=target)
 
     def move(self, pose: Mapping[str, float]) -> None:
-        """Drive the joints (deg, mm) to `pose` and wait until they stand there."""
+        """Drive the joints (deg, mm) to `pose` and wait until they have arrived."""
         self._do("move", "moving", pose=dict(pose), speed=BOOM_SPEED)
         self._expect("arrived")
 
     def poses(self, number: int, seed: int) -> list[dict[str, float]]:
-        """Draw random poses inside the joints' limits."""
+        """Draw random poses inside the joints' limits, deg or mm."""
         return list(self._do("poses", "poses", n=number, seed=seed)["poses"])
 
     def visit(self, stops: Iterable[Stop]) -> int:
-        """Drive to these poses next, in this order; returns how many are still to come."""
+        """Add poses to drive to next, in this order, and return how many are left to visit."""
         self._stops.extend(stops)
         return len(self._stops)
 
     def drive_around(self, dwell_s: float, *, is_by_hand: bool = False) -> None:
-        """Keep moving from one random pose to the next, standing `dwell_s` at each, until closed.
+        """Drive from one random pose to the next until closed.
 
-        Where it `is_by_hand`, the boom goes to the poses of `visit` alone, and stands in between.
+        Args:
+            dwell_s: time to stand at each pose.
+            is_by_hand: drive only to the poses of `visit`, and stand still otherwise.
         """
         drive = self._follow if is_by_hand else partial(self._drive, dwell_s)
         self._autopilot = threading.Thread(target=drive, name="autopilot", daemon=True)
@@ -135,7 +138,7 @@ class SimulatedRig:
         """End the process."""
         self._stopping.set()
         if self._process.stdin is not None and not self._process.stdin.closed:
-            with contextlib.suppress(BrokenPipeError):  # it has ended with a command unread
+            with contextlib.suppress(BrokenPipeError):  # the process ended before it read a command
                 self._process.stdin.close()
         try:
             self._process.wait(timeout=10)
@@ -170,7 +173,7 @@ class SimulatedRig:
                 log.error("the simulated boom stands still: %s", error)
 
     def _follow(self) -> None:
-        """Go to the poses of `visit`, and stand at the last one until there is another."""
+        """Drive to the poses of `visit`, and stand at the last one until there is a new one."""
         try:
             while not self._stopping.wait(_HAND_S):
                 if self._stops:
@@ -197,14 +200,14 @@ class SimulatedRig:
             return self._expect(answer, "error")
 
     def _expect(self, *wanted: str) -> dict[str, Any]:
-        """Return the next event of the process that is one of `wanted`; other events keep their order."""
+        """Return the next event of the process whose kind is in `wanted`; other events keep their order."""
 
         def found() -> dict[str, Any] | None:
             return next((e for e in self._events if e["event"] in {*wanted, "ended"}), None)
 
         with self._arrived:
             if not self._arrived.wait_for(lambda: found() is not None, _ANSWER_S):
-                raise SimulationError(f"the simulated rig did not say {wanted[0]!r} within {_ANSWER_S:g} s")
+                raise SimulationError(f"the simulated rig did not answer {wanted[0]!r} within {_ANSWER_S:g} s")
             answer = found()
             assert answer is not None
             if answer["event"] != "ended":

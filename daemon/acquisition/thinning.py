@@ -1,4 +1,4 @@
-"""Readings and fixes of no session are thinned: they are there to be looked at, and raw captures have them all."""
+"""Thinning of readings and fixes outside sessions: they are stored for viewing only, and raw captures contain all."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ INTERVAL_NS = NS_PER_S
 
 
 class Thinning:
-    """Keeps one reading a channel and one fix a station a second, and every change of a status.
+    """Keeps one reading per channel and one fix per station each second, and every change of a status.
 
-    Events, gaps and failures are all kept, and so is everything of a session.
+    All events, gaps and failures are kept, and all records in a session.
 
     Args:
-        is_of_session: whether an instant lies in a session.
+        is_of_session: returns whether an instant lies in a session.
     """
 
     def __init__(self, is_of_session: Callable[[Stamp], bool]) -> None:

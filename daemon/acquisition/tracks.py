@@ -1,8 +1,8 @@
 """Joints and signals over the last seconds, and the motion of the boom.
 
-Motion is told from noise by a reference that follows a resting joint slowly: a joint moves when it is further than
-`motion_threshold` from its reference, which then jumps to it. So a joint that creeps more slowly than the threshold per
-`REST_NS` counts as standing.
+Motion is distinguished from noise by a reference that follows a resting joint slowly. A joint moves when it is further
+than `motion_threshold` from its reference, which is then set to the joint's value. A joint that creeps more slowly than
+the threshold per `REST_NS` therefore counts as standing.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from drivers.readings import Reading, Status
 
 T = TypeVar("T")
 
-HISTORY_NS = 30 * NS_PER_S  # how long samples are kept for fixes that come late
+HISTORY_NS = 30 * NS_PER_S  # how long samples are kept for late fixes
 RATE_WINDOW_NS = NS_PER_S // 10  # on either side of the instant
-STILL_AFTER_NS = NS_PER_S // 2  # a fix just before motion shows may have been measured when it had begun
-REST_NS = NS_PER_S // 2  # time constant with which a resting joint's reference follows it
-MOTION_STEP_NS = NS_PER_S // 100  # motion is noted this finely
-MAX_GAP_S = 0.25
-STANDING_GAP_NS = NS_PER_S  # the same between two samples that show no motion
+STILL_AFTER_NS = NS_PER_S // 2  # a fix this long before motion shows may have been measured during the motion
+REST_NS = NS_PER_S // 2  # time constant with which a reference follows a resting joint
+MOTION_STEP_NS = NS_PER_S // 100  # resolution with which motion is noted
+MAX_GAP_S = 0.25  # largest distance of the samples around a fix
+STANDING_GAP_NS = NS_PER_S  # the same for two samples that show no motion
 TURN_DEG = 360.0
 
 
@@ -32,10 +32,10 @@ class JointInput:
     """A joint to be joined with fixes.
 
     Attributes:
-        name: of its channel.
-        unit: `deg` or `mm`; degrees are interpolated the short way round.
-        motion_threshold: a change beyond this is motion and no noise, deg or mm.
-        max_gap_s: the samples around a fix may be this far apart at most; STANDING_GAP_NS if they show no motion.
+        name: name of its channel.
+        unit: `deg` or `mm`; degrees are interpolated the shorter way round.
+        motion_threshold: a change of at least this is motion, not noise, deg or mm.
+        max_gap_s: largest distance of the samples around a fix; STANDING_GAP_NS if they show no motion.
     """
 
     name: str
@@ -49,9 +49,9 @@ class SignalInput:
     """A signal to be joined with fixes.
 
     Attributes:
-        name: of its channel.
+        name: name of its channel.
         column: its column in an observations CSV (`boom_valve_mA`).
-        max_age_s: an older value is taken for none.
+        max_age_s: an older value is not used.
     """
 
     name: str
@@ -69,27 +69,27 @@ class State:
 
 
 class History(Generic[T]):
-    """The recent past of something: instants, rising, and what was there."""
+    """Recent history of a quantity: increasing instants, and the item at each."""
 
     def __init__(self) -> None:
         self.times_ns: list[int] = []
         self.items: list[T] = []
 
     def add(self, at_ns: int, item: T) -> None:
-        """Append, and forget what is too old, but for one: it tells what held until the next."""
+        """Append an item, and discard old items except one, which gives the value until the next."""
         times_ns = self.times_ns
         times_ns.append(at_ns)
         self.items.append(item)
-        if at_ns - times_ns[0] > 2 * HISTORY_NS:  # seldom: to cut a list's head is to move its rest
+        if at_ns - times_ns[0] > 2 * HISTORY_NS:  # seldom, because deleting from the front of a list moves the rest
             old = max(bisect_left(times_ns, at_ns - HISTORY_NS) - 1, 0)
             del times_ns[:old], self.items[:old]
 
     def newer(self, at_ns: int) -> bool:
-        """Return True if `at_ns` is beyond all samples."""
+        """Return True if `at_ns` is later than all items."""
         return not self.times_ns or at_ns > self.times_ns[-1]
 
     def latest(self, at_ns: int) -> int:
-        """Index of the last entry at or before `at_ns`; -1 where there is none."""
+        """Return the index of the last item at or before `at_ns`; -1 if there is none."""
         return bisect_right(self.times_ns, at_ns) - 1
 
     def clear(self) -> None:
@@ -104,18 +104,18 @@ class JointTrack:
         self.name, self.unit = joint.name, joint.unit
         self._joint = joint
         self._max_gap_ns = round(joint.max_gap_s * NS_PER_S)
-        self._samples: History[tuple[float | Status, int]] = History()  # value or what is wrong, last direction
+        self._samples: History[tuple[float | Status, int]] = History()  # value or bad status, last direction
         self._jumps: History[None] = History()
         self._reference: float | None = None
         self._direction = 0
 
     @property
     def newest_ns(self) -> int:
-        """Instant of the last sample; far in the past where there is none."""
+        """Instant of the last sample; far in the past if there is none."""
         return self._samples.times_ns[-1] if self._samples.times_ns else -(2**63)
 
     def add(self, at_ns: int, reading: Reading) -> bool:
-        """Take a sample; True when the joint has moved, or is seen for the first time or after a preset."""
+        """Add a sample; return True if the joint has moved, or this is its first sample ever or after a preset."""
         if not self._samples.newer(at_ns):
             return False
         value = reading.value
@@ -136,7 +136,7 @@ class JointTrack:
         return moved
 
     def jumped(self, at_ns: int) -> None:
-        """The encoder was preset: its values before and after have nothing to do with each other."""
+        """Note a preset of the encoder: values before and after it cannot be compared."""
         if self._jumps.newer(at_ns):
             self._jumps.add(at_ns, None)
         self._reference = None
@@ -147,7 +147,12 @@ class JointTrack:
         self._reference = None
 
     def at(self, at_ns: int, of: str = "the fix") -> State | str:
-        """The joint at an instant, or why it is not known; `of` says in words which instant that is."""
+        """Return the joint's state at an instant, or why it is not known.
+
+        Args:
+            at_ns: the instant, monotonic.
+            of: name of the instant for the reason.
+        """
         times_ns, items = self._samples.times_ns, self._samples.items
         before = self._samples.latest(at_ns)
         if before < 0:
@@ -168,13 +173,13 @@ class JointTrack:
         fraction = (at_ns - times_ns[before]) / span_ns if span_ns else 0.0
         value = start + fraction * self._difference(end, start)
         if self.unit == "deg" and fraction >= 0.5:
-            value += TURN_DEG * round((end - value) / TURN_DEG)  # past a wrap: the turn of the nearer sample
+            value += TURN_DEG * round((end - value) / TURN_DEG)  # beyond a wrap: use the turn of the nearer sample
         return State(value, direction, self._rate(at_ns))
 
     def _rate(self, at_ns: int) -> float | None:
-        """Least-squares slope of the samples around an instant; None of a single one."""
+        """Return the least-squares slope of the samples around an instant, per second; None for a single sample."""
         times_ns, items = self._samples.times_ns, self._samples.items
-        # To the next samples beyond the window: two that came close together would say nothing.
+        # Includes the next samples beyond the window: two samples close together would give a poor slope.
         first = max(bisect_right(times_ns, at_ns - RATE_WINDOW_NS) - 1, 0)
         last = bisect_left(times_ns, at_ns + RATE_WINDOW_NS) + 1
         jump = self._jumps.latest(at_ns)
@@ -196,7 +201,7 @@ class JointTrack:
         return slope * NS_PER_S
 
     def _difference(self, to: float, since: float) -> float:
-        """Change from `since` to `to`; of an angle the short way round."""
+        """Return the change from `since` to `to`; for an angle, the shorter way round."""
         change = to - since
         if self.unit == "deg" and not -TURN_DEG / 2 <= change < TURN_DEG / 2:
             change = (change + TURN_DEG / 2) % TURN_DEG - TURN_DEG / 2
@@ -212,7 +217,7 @@ class SignalTrack:
         self._values: History[float | None] = History()
 
     def add(self, at_ns: int, value: float | None) -> None:
-        """Take a value, None for none."""
+        """Add a value; None if the reading has no value."""
         if self._values.newer(at_ns):
             self._values.add(at_ns, value)
 
@@ -220,7 +225,7 @@ class SignalTrack:
         self._values.clear()
 
     def at(self, at_ns: int) -> float | None:
-        """The value at an instant; None where it is bad, too old or not there."""
+        """Return the value at an instant; None if it is bad, too old or missing."""
         last = self._values.latest(at_ns)
         if last < 0 or at_ns - self._values.times_ns[last] > self._max_age_ns:
             return None
@@ -228,15 +233,15 @@ class SignalTrack:
 
 
 class Motion:
-    """When the boom moved last, and which standstill this is."""
+    """Motions of the boom, and the number of each standstill between them."""
 
     def __init__(self, settle_ns: int) -> None:
         self._settle_ns = settle_ns
-        self._ended = 0  # standstills that are over
-        self._moves: History[int] = History()  # how many standstills were over at each motion
+        self._ended = 0  # number of standstills that have ended
+        self._moves: History[int] = History()  # this number at each motion
 
     def note(self, at_ns: int) -> None:
-        """Some joint has moved."""
+        """Note a motion of any joint."""
         if self._moves.times_ns:
             quiet_ns = at_ns - self._moves.times_ns[-1]
             if quiet_ns < MOTION_STEP_NS:
@@ -245,12 +250,12 @@ class Motion:
         self._moves.add(at_ns, self._ended)
 
     def restart(self) -> None:
-        """Begin another standstill: joints may have moved unseen."""
+        """Begin a new standstill, because joints may have moved unnoticed."""
         self._ended += bool(self._moves.times_ns)
         self._moves.clear()
 
     def at(self, at_ns: int) -> tuple[float | None, int | None]:
-        """Dwell in seconds and the number of the standstill, as JoinedFix has them."""
+        """Return the dwell in seconds and the number of the standstill, as in JoinedFix."""
         last = self._moves.latest(at_ns)
         if last < 0:
             return None, None

@@ -1,4 +1,4 @@
-"""An alarm, and the rule that says when there is one."""
+"""Alarms, and the rules that raise them."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from daemon.alarms.evidence import Evidence
 from daemon.host.safe_output import shown
 from daemon.monitoring.notice import Severity
 
-# Subject and text of what is wrong, and its severity where it is not the rule's usual one.
+# Subject and text of a fault, and its severity where that differs from the rule's usual one.
 Finding = tuple[str, str] | tuple[str, str, Severity]
 
-TEXT_MAX = 300  # instruments may say anything, at any length, and with control characters
+TEXT_MAX = 300  # an instrument may send any text of any length, control characters included
 
 
 @dataclass(frozen=True)
@@ -20,11 +20,11 @@ class Alarm:
     """Something that is wrong now.
 
     Attributes:
-        kind: of fault: the name of its rule, `link_down`.
-        subject: what has it: a link, channel, station, joint, session ...
-        severity: warning: measuring goes on, and someone should look; critical: data are lost or cannot be used.
-        text: what is wrong, a clause.
-        remedy: what to do, a sentence.
+        kind: kind of fault: the name of its rule, such as `link_down`.
+        subject: what has the fault: a link, channel, station, joint, session ...
+        severity: warning: measuring continues, but someone should check; critical: data are lost or cannot be used.
+        text: what is wrong, in a clause.
+        remedy: what to do, in one or two sentences.
     """
 
     kind: str
@@ -35,22 +35,22 @@ class Alarm:
 
     @property
     def key(self) -> tuple[str, str]:
-        """Kind and subject, which make it this alarm, whatever its text says."""
+        """Kind and subject, which identify the alarm; its text may change."""
         return self.kind, self.subject
 
 
 @dataclass(frozen=True)
 class Rule:
-    """Says from evidence alone what is wrong now: level-triggered, without memory.
+    """Finds faults in the present evidence alone: level-triggered, without memory of earlier evidence.
 
     Attributes:
-        kind: of its alarms.
-        severity: the usual one.
+        kind: kind of its alarms.
+        severity: usual severity of its alarms.
         remedy: what to do; SUBJECT in it stands for the alarm's subject.
-        after_s: how long a fault must stand before it is an alarm.
-        hold_s: how long its evidence must be gone before the alarm is cleared.
-        meaning: when it raises and clears, for docs/reference/alarms.md.
-        find: its function.
+        after_s: how long a fault must last before an alarm is raised.
+        hold_s: how long the fault must be absent before the alarm is cleared.
+        meaning: when the alarm is raised and cleared, for docs/reference/alarms.md.
+        find: function that yields the faults in the evidence.
     """
 
     kind: str
@@ -62,15 +62,15 @@ class Rule:
     find: Callable[[Evidence], Iterable[Finding]]
 
     def __call__(self, evidence: Evidence) -> Iterator[Alarm]:
-        """Yield an alarm for everything that is wrong now."""
+        """Yield an alarm for every fault in the evidence."""
         for subject, text, *severity in self.find(evidence):
             how = severity[0] if severity else self.severity
-            plain = _cut(shown(text).removeprefix(f"{subject}: "))  # the subject is shown before it
+            plain = _cut(shown(text).removeprefix(f"{subject}: "))  # shown after the subject
             yield Alarm(self.kind, subject, how, plain, self.remedy.replace("SUBJECT", subject))
 
 
 def _cut(text: str) -> str:
-    """Return a text of at most TEXT_MAX characters, cut between words where it can be."""
+    """Shorten a text to at most TEXT_MAX characters, between words where possible."""
     if len(text) <= TEXT_MAX:
         return text
     head, _, _ = text[:TEXT_MAX].rpartition(" ")
@@ -80,7 +80,14 @@ def _cut(text: str) -> str:
 def rule(
     severity: Severity, remedy: str, *, after_s: float = 0.0, hold_s: float = 0.0
 ) -> Callable[[Callable[[Evidence], Iterable[Finding]]], Rule]:
-    """Make a rule of a function: its name is the kind of alarm, its docstring says when the alarm is raised."""
+    """Turn a function into a rule: its name is the kind of alarm, its docstring states when the alarm is raised.
+
+    Args:
+        severity: usual severity of the alarms.
+        remedy: what to do; SUBJECT in it stands for the alarm's subject.
+        after_s: how long a fault must last before an alarm is raised.
+        hold_s: how long the fault must be absent before the alarm is cleared.
+    """
 
     def made(find: Callable[[Evidence], Iterable[Finding]]) -> Rule:
         meaning = " ".join((find.__doc__ or "").split())

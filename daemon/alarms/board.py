@@ -1,7 +1,7 @@
-"""The alarms that are active: raised and cleared by what the rules say, kept in the store, told to the log.
+"""The active alarms: raised and cleared by the rules, kept in the store and logged.
 
-What is active is known in memory first: an alarm shows although the store cannot be written, and is written once it
-can be. Alarms that an earlier run has left go on, with the time they were raised at, if their evidence is still there.
+Active alarms are held in memory first: an alarm is shown even while the store cannot be written, and is written once it
+can be. Alarms left by an earlier run stay active, with their original time, if the rules still find their faults.
 """
 
 from __future__ import annotations
@@ -25,26 +25,26 @@ from drivers.clock import NS_PER_S, Clock, Stamp
 
 log = logging.getLogger(__name__)
 
-GRACE_S = 15.0  # links have opened by then, and devices have been heard, or have not
+GRACE_S = 15.0  # after this time links are open and devices have been received, or there is a fault
 CLEARED_SHOWN = 200
 STOP_S = 5.0
-UNWRITTEN_MAX = 1000  # cleared alarms that wait for a store that cannot be written
+UNWRITTEN_MAX = 1000  # cleared alarms kept in memory while the store cannot be written
 
 _LEVELS: Mapping[Severity, int] = {"warning": logging.WARNING, "critical": logging.ERROR}
 
 
 @dataclass
 class _Active:
-    """An alarm from its raising to its clearing.
+    """An alarm from when it is raised until it is cleared and written.
 
     Attributes:
-        alarm: as its rule has said it last.
-        raised: when it was noticed.
-        seen: when its evidence was there last.
-        hold_s: how long its evidence must be gone before it is cleared.
-        row: its number in the store; None while it is not written.
-        written: what the store has of it.
-        cleared: when it was; None while it is active.
+        alarm: as last returned by its rule.
+        raised: when the alarm was raised.
+        seen: when its rule last found the fault.
+        hold_s: how long the fault must be absent before the alarm is cleared.
+        row: its row in the store; None while it is not written.
+        written: the alarm as it was last written to the store.
+        cleared: when the alarm was cleared; None while it is active.
     """
 
     alarm: Alarm
@@ -65,14 +65,14 @@ def _notice(event: Literal["raised", "cleared"], active: _Active, at: Stamp) -> 
 
 
 class AlarmBoard:
-    """Keeps the alarms. `evaluate` belongs to one thread, once a second; everything else may be called from any.
+    """Keeps the alarms. One thread calls `evaluate` once a second; any thread may call the other methods.
 
     Args:
         table: the store's alarms.
-        gather: what is known now.
-        clock: for ages.
-        rules: what raises and clears alarms; all that there are by default.
-        tell: takes each alarm that is raised, becomes critical or is cleared; returns at once.
+        gather: returns the present evidence.
+        clock: clock for ages.
+        rules: rules that raise and clear alarms; the whole library by default.
+        tell: called with each alarm that is raised, becomes critical or is cleared; must return at once.
     """
 
     def __init__(
@@ -90,26 +90,26 @@ class AlarmBoard:
         self._turn = threading.Lock()
         self._looked = clock.now()
         self._active = {(row["kind"], row["subject"]): self._carried(row) for row in self._table.active()}
-        self._sighted: dict[tuple[str, str], Stamp] = {}  # since when a fault has stood that is no alarm yet
+        self._sighted: dict[tuple[str, str], Stamp] = {}  # when each present fault was first found
         self._unwritten: deque[_Active] = deque(maxlen=UNWRITTEN_MAX)  # cleared ones
         self._failed_rules: dict[str, str] = {}
-        self._told = ""  # the fault of this board that the log has last
+        self._told = ""  # the error of this board that was logged last
         self._to_write, self._stopping = threading.Event(), False
         self._writer = threading.Thread(target=self._run, name="alarms", daemon=True)
 
     def start(self) -> None:
-        """Begin to write alarms to the store, in a thread of its own: a disk may not answer for long."""
+        """Start the thread that writes alarms to the store; a disk may not answer for a long time."""
         self._writer.start()
 
     def stop(self) -> None:
-        """Write what is not written yet and end the thread. Harmless when not started."""
+        """Write pending alarms and end the thread. Does nothing if it was not started."""
         self._stopping = True
         self._to_write.set()
         if self._writer.is_alive():
             self._writer.join(STOP_S)
 
     def evaluate(self) -> None:
-        """Look at everything that is known now; never raises, and waits for no disk."""
+        """Apply all rules to the present evidence; never raises and never waits for the disk."""
         try:
             evidence = self._gather()
             found = self._found(replace(evidence, unwatched={**evidence.unwatched, **self._failed_rules}))
@@ -120,14 +120,15 @@ class AlarmBoard:
             self._to_write.set()
         except Exception as error:
             if str(error) != self._told:
-                log.exception("the alarms could not be looked at")
+                log.exception("the alarms could not be evaluated")
             self._told = str(error)
 
     def status(self) -> dict[str, Any]:
-        """Return the active alarms, the critical and then the oldest first, and when they were looked at.
+        """Return the active alarms, critical ones first and then the oldest first, and the age of the last evaluation.
 
         Returns:
-            `active`: kind, subject, severity, text, remedy, since_utc_ns and age_s of each; `looked_age_s`.
+            `active`: kind, subject, severity, text, remedy, since_utc_ns and age_s of each alarm; `looked_age_s`: time
+            since the last evaluation.
         """
         now = self._clock.now()
         with self._turn:
@@ -144,19 +145,19 @@ class AlarmBoard:
         return {"active": shown, "looked_age_s": looked_age_s}
 
     def list_command(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
-        """The active alarms, as `status` shows them; with `all` those that were cleared too, newest first."""
+        """Return the active alarms as `status` does; with `all` also the newest cleared ones, newest first."""
         cleared = self._table.cleared(CLEARED_SHOWN) if arguments.get("all") is True else []
         return {**self.status(), "cleared": cleared}
 
     # ---- parts -------------------------------------------------------------------------------------------------------
 
     def _carried(self, row: Mapping[str, Any]) -> _Active:
-        """Go on with an alarm of an earlier run."""
+        """Restore an alarm of an earlier run."""
         alarm = Alarm(row["kind"], row["subject"], row["severity"], row["text"], row["remedy"])
         return _Active(alarm, row["raised"], self._looked, GRACE_S, row["id"], alarm)
 
     def _found(self, evidence: Evidence) -> dict[tuple[str, str], tuple[Alarm, Rule]]:
-        """Apply the rules; one that fails is left out."""
+        """Apply the rules; a rule that fails is skipped and noted."""
         found: dict[tuple[str, str], tuple[Alarm, Rule]] = {}
         failed: dict[str, str] = {}
         for rule in self._rules:
@@ -166,7 +167,7 @@ class AlarmBoard:
             except Exception as error:
                 failed[rule.kind] = f"{type(error).__name__}: {error}"
                 if rule.kind not in self._failed_rules:
-                    log.exception("the rule of alarms %s has failed", rule.kind)
+                    log.exception("the alarm rule %s has failed", rule.kind)
         self._failed_rules = failed
         return found
 
@@ -209,7 +210,7 @@ class AlarmBoard:
             self.write()
 
     def write(self) -> None:
-        """Bring the store up to date; what cannot be written now is written the next time."""
+        """Write all changes to the store; what cannot be written now is retried after the next evaluation."""
         with self._turn:
             cleared, active = list(self._unwritten), list(self._active.values())
         try:
@@ -221,7 +222,7 @@ class AlarmBoard:
             for one in active:
                 self._write_one(one)
         except (sqlite3.Error, StoreError):
-            log.debug("alarms cannot be written", exc_info=True)  # there is an alarm about that
+            log.debug("alarms cannot be written", exc_info=True)  # the alarm not_storing reports it
 
     def _write_one(self, active: _Active) -> None:
         alarm = active.alarm

@@ -1,4 +1,4 @@
-"""Evidence that rules may look at, at one instant. What nobody has told is "nothing known", and raises nothing."""
+"""The evidence that the rules check, at one instant. A part that is not known raises no alarm."""
 
 from __future__ import annotations
 
@@ -20,33 +20,33 @@ from drivers.readings import EventKind
 
 @dataclass(frozen=True)
 class Evidence:
-    """A snapshot of everything that rules may look at.
+    """A snapshot of everything that the rules may check.
 
     Attributes:
-        now: when it was taken.
-        running_s: since the daemon began to watch.
+        now: time of the snapshot.
+        running_s: time since the daemon began to collect evidence.
         acquisition: links, channels, stations, gaps and the last events.
         has_simulation_ended: the process of a simulated rig has ended.
-        session: the open one.
-        suspicions: stations that may be on another prism than the session's own.
-        newest_excluded: why the open session's newest fix does not count, a clause; None where it does, or is old.
-        prisms_fault: why the joints cannot be asked whether a station is on its prism; None where they can.
-        setup: the one that the station stands in.
-        failed_jobs: those that somebody should look at.
-        model: the live one.
-        store: its file and its disk; None while not known.
-        keeping: its room and its backups.
-        is_store_new: the store has never seen a job, and yet models lie beside it.
-        previous_run: when the daemon's run before this one was last alive, by a clock that can be compared.
-        control_faults: control socket on which no one can connect -> why.
-        metrics_fault: why nobody can read the metrics; None where they can be read, or are not wanted.
-        notice_faults: ways out of the machine by which notices are not delivered at present -> why.
-        untrained_sessions: closed sessions that nothing trains on -> why; those that newer ones make up for are not
-            there.
-        zeros_lost: joints whose encoder has jumped since the newest closed session was started or accepted, unchecked.
+        session: the open session; None without one.
+        suspicions: stations that may follow a prism other than the session's.
+        newest_excluded: why the open session's newest fix is not used, a clause; None if it is used, or old.
+        prisms_fault: why stations' prisms cannot be checked against the joints; None where they can.
+        setup: the set-up that the station stands in.
+        failed_jobs: failed jobs that need attention.
+        model: the live model.
+        store: state of the store's file and disk; None while not known.
+        keeping: free space of the store, and its backups.
+        is_store_new: the store has never held a job, but models of an earlier store lie beside it.
+        previous_run: when the daemon's previous run was last alive, by a comparable clock.
+        control_faults: control socket to which no one can connect -> why.
+        metrics_fault: why the metrics cannot be read; None where they can, or are not configured.
+        notice_faults: target to which notices cannot be delivered at present -> why.
+        untrained_sessions: closed session that no training uses -> why; without sessions that newer ones replace.
+        zeros_lost: joints whose encoder has jumped since the newest closed session was started or accepted, and whose
+            zero has not been checked.
         ended_threads: thread of the daemon that an error has ended -> the error.
         clock_lost: when the computer's clock was last synchronised, if it no longer is.
-        unwatched: rule or part of the evidence that has failed itself -> why.
+        unwatched: rule or part of the evidence that has itself failed -> why.
     """
 
     now: Stamp
@@ -80,11 +80,16 @@ class Evidence:
 
     @property
     def is_storing(self) -> bool:
-        """True if captures are stored, and so decoded: until they are, every device looks silent and may not be."""
+        """True if captures are stored and so decoded; until they are, every device appears silent."""
         return self.acquisition.error is None and not self.acquisition.is_write_hung
 
     def active_events(self, kind: EventKind, *ended_by: EventKind) -> list[EventStatus]:
-        """Return the active events of a kind: without code 0, and without a later event of `ended_by` of the device."""
+        """Return the last events of a kind that are still active: not of code 0, and not ended by a later event.
+
+        Args:
+            kind: kind of the events.
+            ended_by: kinds of later events of the same device that end the state.
+        """
         last = {(event.device, event.kind): event.number for event in self.acquisition.last_events}
         return [
             event
@@ -99,29 +104,29 @@ class Evidence:
         return [event for event in self.acquisition.last_events if event.kind == kind and event.age_s <= within_s]
 
     def link_of(self, device: str) -> LinkStatus | None:
-        """The link that a channel is read from, a station's own, or the link of that name; None if there is none."""
+        """The link of a channel or station, or the link of that name; None if there is none."""
         name = next((channel.link for channel in self.acquisition.channels if channel.name == device), device)
         return next((link for link in self.acquisition.links if link.name == name), None)
 
     def is_cut_off(self, device: str) -> bool:
-        """True if the device's link is closed, which explains whatever else is wrong with it."""
+        """True if the device's link is closed, which explains any other fault of the device."""
         link = self.link_of(device)
         return link is not None and link.up is False
 
 
-# Part of the evidence -> its name in the alarm that it cannot be watched.
+# Part of the evidence -> its name in the alarm `not_watched`.
 _PARTS = {
     "acquisition": "acquisition",
     "has_simulation_ended": "the simulated rig",
     "session": "the open session",
     "suspicions": "the prisms",
     "newest_excluded": "the newest fix",
-    "prisms_fault": "what the joints say of prisms",
+    "prisms_fault": "the check of prisms against the joints",
     "setup": "the set-ups",
     "failed_jobs": "the jobs",
     "model": "the live model",
     "store": "the store's files",
-    "keeping": "the store's room and backups",
+    "keeping": "the store's free space and backups",
     "is_store_new": "the models",
     "untrained_sessions": "the sessions",
     "zeros_lost": "the joints' zeros",
@@ -134,12 +139,12 @@ _PARTS = {
 
 
 class Gatherer:
-    """Takes a snapshot of everything, again and again. A part that fails keeps what it was last known to be.
+    """Takes snapshots of all evidence. A part that fails keeps its last known value.
 
     Args:
-        clock: time of the snapshots.
-        previous_run: as of `Evidence`.
-        parts: field of `Evidence` -> function that tells it.
+        clock: clock for the snapshots.
+        previous_run: as in `Evidence`.
+        parts: field of `Evidence` -> function that returns it.
     """
 
     def __init__(self, clock: Clock, previous_run: Stamp | None, parts: Mapping[str, Callable[[], object]]) -> None:
@@ -155,7 +160,7 @@ class Gatherer:
         for name, look in self._parts.items():
             try:
                 known[name] = look()
-            except Exception as error:  # noqa: BLE001 - whatever fails must not keep the others from being looked at
+            except Exception as error:  # noqa: BLE001 - a part that fails must not stop the others
                 failed[_PARTS[name]] = f"{type(error).__name__}: {error}"
         running_s = now.since(self._began) / NS_PER_S
         self._known = replace(self._known, now=now, running_s=running_s, unwatched=failed, **known)

@@ -1,4 +1,4 @@
-"""The rules there are, every one in every file of `daemon/alarms/rules`."""
+"""The library of alarm rules: all rules in all files of `daemon/alarms/rules`."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from daemon.alarms.alarm import Rule
 
 @cache
 def library() -> tuple[Rule, ...]:
-    """Return all rules, by file and in the order of each file."""
+    """Return all rules, sorted by file and then in the order within each file."""
     found: dict[str, Rule] = {}
     for name in sorted(module.name for module in pkgutil.iter_modules(rules.__path__)):
         for value in vars(importlib.import_module(f"{rules.__name__}.{name}")).values():

@@ -38,7 +38,7 @@ channel = "can0"
 [[station]]
 serial.path = "/dev/rigcal-station"
 """
-MAX_SOCKET_PATH_BYTES = 107  # unix(7): sun_path holds 108 bytes with the closing zero
+MAX_SOCKET_PATH_BYTES = 107  # unix(7): sun_path holds 108 bytes with the terminating zero
 
 
 class ConfigError(CommandError):
@@ -51,13 +51,13 @@ class Config(Section):
     Attributes:
         rig: a shipped rig's name or a path to a rig file.
         state_directory: where store, models and reports live.
-        socket: the control socket; when absent `control.sock` in the service's runtime directory, for another daemon in
-            its state directory.
-        read_group: whose members may look at the daemon's state and not change it, by a socket `status.sock` beside the
-            control socket; no one when absent.
+        socket: the control socket; when absent, `control.sock` in the runtime directory of the service, or in the state
+            directory of a daemon that is not run as the service.
+        read_group: group whose members may view the daemon's state but not change it, through a socket `status.sock`
+            beside the control socket; no one when absent.
         metrics: where metrics are served; nowhere when absent.
-        notify: where notices of alarms go; nowhere when absent.
-        web: where the page is served, which `rigcal web` does.
+        notify: where notices of alarms are sent; nowhere when absent.
+        web: where `rigcal web` serves the page.
     """
 
     rig: str
@@ -86,7 +86,7 @@ class Config(Section):
     @model_validator(mode="after")
     def _there_is_one_station(self) -> Config:
         if len(self.station) > 1:
-            raise ValueError("sessions know one station: keep one [[station]], and give another a rigcal of its own")
+            raise ValueError("sessions use one station: keep one [[station]], and run a second rigcal for another one")
         return self
 
     @model_validator(mode="after")
@@ -95,7 +95,7 @@ class Config(Section):
         paths = [slcan_port(link.channel) for link in self.can if link.interface == "slcan"]
         ports += map(os.path.realpath, (*paths, *(station.serial.path for station in self.station)))
         if port := next((port for port in ports if ports.count(port) > 1), None):
-            raise ValueError(f"two links are at {port!r}; a port belongs to one link")
+            raise ValueError(f"two links use {port!r}; a port belongs to one link")
         return self
 
     @model_validator(mode="after")
@@ -105,9 +105,9 @@ class Config(Section):
         wanted = self.tip.can.link
         link = next((section for section in self.can if section.name == wanted), None)
         if link is None:
-            raise ValueError(f"tip.can.link is {wanted!r}, and no [[can]] link is called so")
+            raise ValueError(f"tip.can.link is {wanted!r}, but no [[can]] link has this name")
         if not link.allow_transmit:
-            raise ValueError(f"tip.can needs allow_transmit = true on link {wanted!r}; CAN is listen-only without")
+            raise ValueError(f"tip.can needs allow_transmit = true on link {wanted!r}; without it CAN is listen-only")
         return self
 
     def own_identifiers(self, link: str) -> tuple[int, ...]:
@@ -122,7 +122,7 @@ class Config(Section):
 
     @property
     def tokens_path(self) -> Path:
-        """Path of the page's tokens."""
+        """Path of the token file of the page."""
         return self.web.tokens or self.state_directory / "web-tokens.json"
 
     @property
@@ -146,7 +146,7 @@ def parse_config(text: str, source: Path) -> Config:
         source: the file, for messages and as the base of relative paths.
 
     Raises:
-        ConfigError: every wrong key in one message, a line each.
+        ConfigError: the configuration is wrong; the message has one line per wrong key.
     """
     try:
         raw = parse_toml(text)
@@ -173,7 +173,9 @@ def parse_config(text: str, source: Path) -> Config:
         }
     )
     if config.read_group is not None and config.socket_path == reading_socket(config.socket_path):
-        raise ConfigError(f"{source}: socket: {config.socket_path} is where `read_group` looks; give it another name")
+        raise ConfigError(
+            f"{source}: socket: {config.socket_path} is the socket of `read_group`; give `socket` another name"
+        )
     sockets = [config.socket_path] + ([] if config.read_group is None else [reading_socket(config.socket_path)])
     longest = max(sockets, key=lambda path: len(os.fsencode(path)))
     if len(os.fsencode(longest)) > MAX_SOCKET_PATH_BYTES:
@@ -185,22 +187,29 @@ def parse_config(text: str, source: Path) -> Config:
 
 
 def _installed_socket(source: Path) -> Path | None:
-    """Return where the installed service listens, for whoever reads its configuration; systemd tells the service."""
+    """Return the installed service's socket for a client that reads its configuration; None for anything else.
+
+    The service itself gets the directory from systemd.
+    """
     is_client = source == INSTALLED_CONFIG.resolve() and "RUNTIME_DIRECTORY" not in os.environ
     return INSTALLED_SOCKET if is_client else None
 
 
 def _require_no_zero_bytes(value: object, source: Path, key: str = "") -> None:
-    """Refuse texts that no path, name or argument of a program can have: the system takes them to end there."""
+    """Refuse texts with zero bytes, at which the system would end a path, name or program argument."""
     if isinstance(value, str) and "\0" in value:
-        raise ConfigError(f"{source}: {key}: holds a zero byte (\\u0000); take it out")
+        raise ConfigError(f"{source}: {key}: contains a zero byte (\\u0000); remove it")
     items = value.items() if isinstance(value, dict) else enumerate(value, 1) if isinstance(value, list) else ()
     for name, inner in items:
         _require_no_zero_bytes(inner, source, f"{key}.{name!s:.{_QUOTED}}".lstrip("."))
 
 
 def read_config(path: Path) -> Config:
-    """Read and check a configuration file; ConfigError says what is wrong with it."""
+    """Read and check a configuration file.
+
+    Raises:
+        ConfigError: the file cannot be read, or its configuration is wrong.
+    """
     try:
         return parse_config(read_text(path, LONGEST), path.resolve())
     except OSError as error:
@@ -210,7 +219,7 @@ def read_config(path: Path) -> Config:
 
 
 def _sentence(error: ErrorDetails) -> str:
-    """Return one pydantic error as `key: fault (allowed: ...)`."""
+    """Return one pydantic error as `key: fault; allowed ...` or `key: fault, found ...`."""
     key = ".".join(str(part)[:_QUOTED] for part in place(error)) or "file"
     if error["type"] == "extra_forbidden":
         allowed = ", ".join(sorted(section_at(Config, error["loc"][:-1]).model_fields))

@@ -24,14 +24,14 @@ class CanSection(Section):
     """A CAN link.
 
     Attributes:
-        name: which of the rig's channels it serves (their `link`).
-        interface: kind of adapter, as python-can names it; `playback` plays a captured log as if its first frame came
-            now.
+        name: name of the link, by which the rig's channels refer to it (their `link`).
+        interface: kind of adapter, as python-can names it; `playback` plays a captured log as if its first frame
+            arrived now.
         channel: interface, port or group, as python-can names it (`can0`, `/dev/ttyACM0`); for `playback` the log.
         bitrate: bit/s of the bus, for an slcan adapter; on socketcan systemd-networkd sets it.
         allow_transmit: rigcal may send on this bus: SYNC, and active set-up of the nodes listed.
         transmit_nodes: CANopen nodes that may be written to.
-        sync_period_ms: send SYNC this often, so that all joints are sampled at one instant.
+        sync_period_ms: period at which SYNC is sent, so that all joints are sampled at one instant.
         options: further settings of the python-can interface.
     """
 
@@ -52,9 +52,11 @@ class CanSection(Section):
     @model_validator(mode="after")
     def _sending_is_said(self) -> CanSection:
         if self.interface == "playback" and self.allow_transmit:
-            raise ValueError("a log that is played back cannot be sent to: remove allow_transmit")
+            raise ValueError("nothing can be sent to a log that is played back; remove allow_transmit")
         if not self.allow_transmit and (self.transmit_nodes or self.sync_period_ms):
-            raise ValueError("transmit_nodes and sync_period_ms need allow_transmit = true; CAN is listen-only without")
+            raise ValueError(
+                "transmit_nodes and sync_period_ms need allow_transmit = true; without it CAN is listen-only"
+            )
         return self
 
     @field_validator("options", mode="before")
@@ -68,7 +70,7 @@ class CanSection(Section):
     @classmethod
     def _nodes_exist(cls, nodes: tuple[int, ...]) -> tuple[int, ...]:
         if any(not 1 <= node <= 127 for node in nodes):
-            raise ValueError("CANopen nodes are 1 to 127")
+            raise ValueError("CANopen nodes have numbers from 1 to 127")
         return nodes
 
 
@@ -76,10 +78,10 @@ class SessionsSection(Section):
     """Calibration sessions.
 
     Attributes:
-        settle_s: how long the boom must have stood before its fixes count as one standstill.
+        settle_s: how long the boom must have been still before its fixes count as one standstill.
         fixes_per_shot: how many good fixes are averaged for a control point.
-        shot_timeout_s: how long to wait for them.
-        control_tolerance_mm: a control point that is further off than this says that the set-up moved.
+        shot_timeout_s: how long to wait for these fixes.
+        control_tolerance_mm: a control point that is off by more than this shows that the set-up has moved.
     """
 
     settle_s: float = Field(default=1.0, ge=0, le=3600)
@@ -94,8 +96,8 @@ class JobsSection(Section):
     Attributes:
         enabled: closed sessions trigger jobs.
         time_limit_s: a job that runs longer is stopped.
-        max_attempts: how often a job is started that something interrupts; stops of the daemon do not count.
-        seed: of every random choice in identification and residual training.
+        max_attempts: how often a job that is interrupted is started; stops of the daemon do not count as interruptions.
+        seed: seed of every random choice in identification and residual training.
     """
 
     enabled: bool = True
@@ -105,15 +107,15 @@ class JobsSection(Section):
 
 
 class StoreSection(Section):
-    """Contents of the store that are kept, and its backups. Sessions, their captures, and models are always kept.
+    """What the store keeps, and its backups. Sessions, their captures, and models are always kept.
 
     Attributes:
-        keep_days: captures and readings outside sessions that are older are deleted; kept while there is room when
-            absent.
-        free_gb: where the disk and free pages of the store together have less room, in GiB, or less than a tenth of the
-            disk, the oldest of them are deleted.
-        backup_directory: where a backup is made every day, better on another disk; none are made when absent.
-        backups: how many are kept.
+        keep_days: captures and readings outside sessions are deleted after this many days; when absent, they are kept
+            while there is space.
+        free_gb: the oldest captures and readings outside sessions are deleted while the free space on the disk and in
+            the store's free pages together is below this, in GiB, or below a tenth of the disk.
+        backup_directory: where a backup is made every day, preferably on a different disk; none are made when absent.
+        backups: how many backups are kept.
     """
 
     keep_days: float | None = Field(default=None, ge=1, le=36_500)
@@ -123,7 +125,7 @@ class StoreSection(Section):
 
     @property
     def free_bytes(self) -> int:
-        """Room that the store should have."""
+        """Free space that the store should have, in bytes."""
         return round(self.free_gb * 2**30)
 
 
@@ -131,20 +133,20 @@ class ReportSection(Section):
     """The reports of jobs.
 
     Attributes:
-        tolerance_mm: root mean square error on held-out fixes that the machine may have; reports then say whether it
-            passed. Without it they say that no tolerance is stated.
+        tolerance_mm: largest root mean square error on held-out fixes that the machine may have; reports then state
+            whether the machine passed. Without it they state that no tolerance is given.
     """
 
     tolerance_mm: float | None = Field(default=None, gt=0)
 
 
 class TipCanSection(Section):
-    """The live corrected tip on a CAN link: two frames a time, as docs/reference/tip-frames.md has them.
+    """The live corrected tip on a CAN link: two frames per tip, as docs/reference/tip-frames.md describes.
 
     Attributes:
         link: name of a [[can]] link that may transmit.
-        arbitration_id: 11-bit identifier of the first frame; the second has the next one. Both must be free in CANopen,
-            680h to 6DFh.
+        arbitration_id: 11-bit identifier of the first frame; the second frame has the next identifier. Both must be
+            free in CANopen: 680h to 6DFh.
     """
 
     link: str
@@ -159,7 +161,7 @@ class TipCanSection(Section):
     @classmethod
     def _is_free(cls, first: int) -> int:
         if not all(is_free(identifier) for identifier in range(first, first + FRAMES)):
-            raise ValueError("CANopen leaves 680h to 6DFh free, and two identifiers are needed: give 0x680 to 0x6DE")
+            raise ValueError("CANopen leaves 680h to 6DFh free, and two identifiers are needed; give 0x680 to 0x6DE")
         return first
 
 
@@ -167,9 +169,9 @@ class TipSection(Section):
     """The live corrected tip.
 
     Attributes:
-        prism: which prism's place it is, where a command names none.
-        rate_hz: how often it is sent.
-        can: where it is sent; nowhere when absent.
+        prism: prism whose place is given as the tip, unless a command names one.
+        rate_hz: how often the tip is sent.
+        can: where the tip is sent; nowhere when absent.
     """
 
     prism: str
@@ -178,10 +180,11 @@ class TipSection(Section):
 
 
 class MetricsSection(Section):
-    """Metrics for Prometheus, on the loopback interface alone.
+    """Metrics for Prometheus, on the loopback interface only.
 
     Attributes:
-        port: where they are served, as docs/reference/metrics.md says; 0 for any that is free, which the log names.
+        port: port on which they are served, as docs/reference/metrics.md describes; 0 for any free port, which is
+            logged.
     """
 
     port: int = Field(ge=0, le=65535)
@@ -191,10 +194,10 @@ class NotifySection(Section):
     """Notices of alarms to people elsewhere: by a webhook, by a command, or by both.
 
     Attributes:
-        webhook_url: takes each message as JSON by POST; its key `text` is what chat services show.
+        webhook_url: address to which each message is sent as JSON by POST; chat services show its key `text`.
         command: a program with its arguments, run without a shell; it gets each message as an e-mail on its standard
-            input, as `sendmail ADDRESS` and `msmtp ADDRESS` take it.
-        least: alarms below this severity are not told.
+            input, as `sendmail ADDRESS` and `msmtp ADDRESS` expect.
+        least: lowest severity of alarms that are sent.
     """
 
     webhook_url: str | None = None
@@ -204,17 +207,17 @@ class NotifySection(Section):
     @field_validator("webhook_url")
     @classmethod
     def _is_http(cls, url: str | None) -> str | None:
-        # What an error says of an address that no client takes would hold its secret.
+        # An address that no client accepts must be refused here: a later error message would contain its secret.
         try:
             parts = urlsplit(url or "http://none")
             is_good = parts.scheme in ("http", "https") and bool(parts.hostname) and parts.port != 0
-            (parts.hostname or "").encode("idna")  # as the name is looked up: a label may be too long, or empty
+            (parts.hostname or "").encode("idna")  # as in the name look-up: a label may be too long, or empty
         except ValueError:
             is_good = False
         is_plain = all("!" <= letter <= "~" for letter in url or "")
         if not is_good or not is_plain or parts.username is not None:
             raise ValueError(
-                "give the address of a web server, without user, blanks or others than ASCII: https://HOST/PATH"
+                "give the address of a web server, without user, blanks or non-ASCII characters: https://HOST/PATH"
             )
         return url
 
@@ -222,13 +225,13 @@ class NotifySection(Section):
     @classmethod
     def _is_a_program(cls, command: tuple[str, ...]) -> tuple[str, ...]:
         if command and not command[0].startswith("/"):
-            raise ValueError("the program needs its whole path, as in ['/usr/bin/msmtp', 'someone@example.com']")
+            raise ValueError("give the program's full path, as in ['/usr/bin/msmtp', 'someone@example.com']")
         return command
 
     @model_validator(mode="after")
     def _goes_somewhere(self) -> NotifySection:
         if self.webhook_url is None and not self.command:
-            raise ValueError("give webhook_url, command, or both: notices need a way out")
+            raise ValueError("give webhook_url, command, or both; otherwise notices cannot be sent")
         return self
 
 
@@ -236,11 +239,11 @@ class WebSection(Section):
     """The operator's page, served by `rigcal web`.
 
     Attributes:
-        host: address that it is served at; any but a loopback one needs a certificate and tokens.
-        port: where.
+        host: address at which the page is served; any address other than loopback needs a certificate and tokens.
+        port: port on which the page is served.
         certificate, key: PEM files for TLS; both or neither.
-        names: names by which browsers call this computer, beside its host name.
-        tokens: file of the tokens; `web-tokens.json` in the state directory when absent.
+        names: names by which browsers address this computer, in addition to its host name.
+        tokens: token file; `web-tokens.json` in the state directory when absent.
     """
 
     host: str = "127.0.0.1"
@@ -251,6 +254,10 @@ class WebSection(Section):
     tokens: Path | None = None
 
     def beside(self, base: Path) -> WebSection:
-        """Return the same with paths that are relative to the configuration's directory."""
+        """Return a copy whose relative paths are resolved against the configuration's directory.
+
+        Args:
+            base: directory of the configuration.
+        """
         paths = {name: getattr(self, name) for name in ("certificate", "key", "tokens")}
         return self.model_copy(update={name: path and base / path for name, path in paths.items()})

@@ -1,7 +1,7 @@
-"""The protocol of the control socket: one JSON object a line, each way; and the client's side of it.
+"""The protocol of the control socket, one JSON object per line in each direction, and its client.
 
 Request `{"command": "session.start", "arguments": {...}}`; answer `{"ok": true, "result": ...}` or
-`{"ok": false, "status": 2, "error": "one sentence"}`. `status` is the exit status a command line should end with.
+`{"ok": false, "status": 2, "error": "one sentence"}`. `status` is the exit status with which a command line should end.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from daemon.host.safe_output import shown
 
 MAX_LINE_BYTES = 1 << 20
 MAX_ERROR_CHARACTERS = 2000
-MAX_DEPTH = 20  # of lists and objects in a request; those of our commands have four at most
+MAX_DEPTH = 20  # nesting of lists and objects in a request; commands need at most four levels
 MAX_WHOLE = 2**63 - 1  # the store keeps whole numbers in 64 bits
 _FORM = '{"command": NAME, "arguments": {...}}'
 
@@ -34,8 +34,8 @@ def parse_request(line: bytes) -> tuple[str, dict[str, Any]]:
     """Return the command and the arguments of a request.
 
     Raises:
-        CommandError: it is no request, or holds what no command can use: numbers that are not finite or need more than
-            64 bits, text that is no Unicode, deeper nesting than any command has.
+        CommandError: the line is not a request, or contains what no command can use: numbers that are not finite or
+            need more than 64 bits, text that is not valid Unicode, or nesting deeper than `MAX_DEPTH`.
     """
     if len(line) > MAX_LINE_BYTES:
         raise CommandError(f"request longer than {MAX_LINE_BYTES} bytes")
@@ -46,10 +46,10 @@ def parse_request(line: bytes) -> tuple[str, dict[str, Any]]:
     except RecursionError:
         raise _too_deep() from None
     if not isinstance(request, dict) or not isinstance(request.get("command"), str):
-        raise CommandError(f"a request is one JSON object a line: {_FORM}")
+        raise CommandError(f"a request is one JSON object per line: {_FORM}")
     _check_values(request)
     if unknown := sorted(request.keys() - {"command", "arguments"}):
-        raise CommandError(f"a request has no {shown(unknown[0], 80)}; it is {_FORM}")
+        raise CommandError(f"unknown key {shown(unknown[0], 80)} in the request; a request is {_FORM}")
     arguments = request.get("arguments", {})
     if not isinstance(arguments, dict):
         raise CommandError("arguments must be a JSON object")
@@ -57,19 +57,24 @@ def parse_request(line: bytes) -> tuple[str, dict[str, Any]]:
 
 
 def answer_line(result: object) -> bytes:
-    """Return the answer of a command that was carried out."""
+    """Return the answer to a command that succeeded."""
     return json.dumps({"ok": True, "result": result}).encode() + b"\n"
 
 
 def refusal_line(message: str, status: int) -> bytes:
-    """Return the answer of a command that was not carried out; a message without end is cut off."""
+    """Return the answer to a command that was refused or failed.
+
+    Args:
+        message: why; cut off after `MAX_ERROR_CHARACTERS`.
+        status: exit status for a command line.
+    """
     if len(message) > MAX_ERROR_CHARACTERS:
         message = f"{message[:MAX_ERROR_CHARACTERS]}..."
     return json.dumps({"ok": False, "status": status, "error": message}).encode() + b"\n"
 
 
 def _no_number(text: str) -> NoReturn:
-    raise CommandError(f"a request holds finite numbers only, not {text}")
+    raise CommandError(f"a request may contain finite numbers only, not {text}")
 
 
 def _finite(text: str) -> float:
@@ -80,7 +85,7 @@ def _finite(text: str) -> float:
 def _whole(text: str) -> int:
     if len(text) <= len(str(-MAX_WHOLE)) and -MAX_WHOLE - 1 <= (value := int(text)) <= MAX_WHOLE:
         return value
-    raise CommandError(f"a request's whole numbers have 64 bits, which {text:.20} has not")
+    raise CommandError(f"whole numbers in a request must fit in 64 bits, and {text:.20} does not")
 
 
 def _check_values(request: object) -> None:
@@ -105,18 +110,22 @@ def _check_text(text: str) -> None:
     try:
         text.encode()
     except UnicodeEncodeError as error:
-        raise CommandError(f"a request's texts are Unicode; {text[error.start]!a} is half a character") from None
+        raise CommandError(f"texts in a request must be Unicode; {text[error.start]!a} is half a character") from None
 
 
 def _too_deep() -> CommandError:
-    return CommandError(f"a request nests at most {MAX_DEPTH} lists and objects")
+    return CommandError(f"a request may nest lists and objects at most {MAX_DEPTH} deep")
 
 
 # ---- the client's side -----------------------------------------------------------------------------------------------
 
 
 def how_to_be_let_in(control_path: Path) -> str:
-    """Say how a user gets access who may not use a daemon's control socket: a clause that names its group, if any."""
+    """Return how a user without access to a control socket can get it: a clause that names the socket's group, if any.
+
+    Args:
+        control_path: the control socket.
+    """
     try:
         gid = control_path.stat().st_gid
     except OSError:
@@ -127,13 +136,19 @@ def how_to_be_let_in(control_path: Path) -> str:
         group = grp.getgrgid(gid).gr_name
     except (KeyError, OSError):
         group = str(gid)
-    return f"join the group {group} (`sudo adduser NAME {group}`, then log in anew), or use sudo"
+    return f"join the group {group} (`sudo adduser NAME {group}`, then log in again), or use sudo"
 
 
 def request(path: Path, command: str, arguments: Mapping[str, Any] | None = None, *, timeout_s: float = 120.0) -> Any:
     """Send one command to the running daemon and return its result.
 
-    Who may not use the control socket is answered by the one for those who may only look, where there is one.
+    A user without access to the control socket is served by the read-only socket, where there is one.
+
+    Args:
+        path: the control socket.
+        command: name of the command.
+        arguments: its arguments.
+        timeout_s: how long to wait for the answer.
 
     Raises:
         CommandError: no daemon is listening, it refused, or it did not answer within `timeout_s`.
@@ -146,7 +161,7 @@ def request(path: Path, command: str, arguments: Mapping[str, Any] | None = None
             line = _exchange_reading(path, message, timeout_s)
     except TimeoutError:
         raise CommandError(
-            f"the daemon at {path} did not answer within {timeout_s:g} s: it hangs, is stopped by a signal, or the "
+            f"the daemon at {path} did not answer within {timeout_s:g} s: it hangs, was stopped by a signal, or the "
             "computer is too busy; see its log",
             FAILED,
         ) from None
@@ -156,7 +171,7 @@ def request(path: Path, command: str, arguments: Mapping[str, Any] | None = None
 
 
 def request_line(command: str, arguments: Mapping[str, Any] | None = None) -> bytes:
-    """Return a request as it is sent."""
+    """Return a request as the line that is sent."""
     return json.dumps({"command": command, "arguments": dict(arguments or {})}).encode() + b"\n"
 
 
@@ -164,11 +179,11 @@ def result_of(line: bytes, path: Path) -> Any:
     """Return the result in an answer.
 
     Args:
-        line: the answer; b"" where the connection was closed without one.
+        line: the answer; b"" where the connection was closed without an answer.
         path: the socket, for messages.
 
     Raises:
-        CommandError: there is no whole answer, or the daemon refused.
+        CommandError: there is no complete answer, or the daemon refused.
     """
     if not line.endswith(b"\n"):
         raise CommandError(f"the daemon at {path} closed the connection without an answer; see its log", FAILED)
@@ -182,13 +197,13 @@ def unreachable(path: Path, error: OSError) -> CommandError:
     """Return the error of a client that finds no daemon at a socket."""
     return CommandError(
         f"no daemon is listening at {path} ({error.strerror or error}); start one with `rigcal run`, "
-        "or name its socket with --socket (that of `rigcal run --sim` is rigcal-sim/control.sock)",
+        "or name its socket with --socket (`rigcal run --sim` uses rigcal-sim/control.sock)",
         FAILED,
     )
 
 
 def _exchange_reading(control_path: Path, message: bytes, timeout_s: float) -> bytes:
-    """Send a request to the socket for those who may only look."""
+    """Send a request to the read-only socket."""
     try:
         return _exchange(reading_socket(control_path), message, timeout_s)
     except TimeoutError:
@@ -198,11 +213,11 @@ def _exchange_reading(control_path: Path, message: bytes, timeout_s: float) -> b
 
 
 def _exchange(path: Path, message: bytes, timeout_s: float) -> bytes:
-    """Send a line; return the one that comes back, b"" where none does."""
+    """Send a line and return the answer; b"" where there is none."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection:
         connection.settimeout(timeout_s)
         connection.connect(str(path))
-        # A daemon that refuses a connection says why and closes it, perhaps before it was sent anything.
+        # A daemon that refuses a connection sends the reason and closes, perhaps before it has received anything.
         with contextlib.suppress(BrokenPipeError, ConnectionResetError):
             connection.sendall(message)
         with connection.makefile("rb") as stream:
@@ -216,11 +231,11 @@ def _exchange(path: Path, message: bytes, timeout_s: float) -> bytes:
 
 
 def reading_only(handlers: Mapping[str, Handler], control_path: Path) -> dict[str, Handler]:
-    """Return handlers of the same commands; those that change something are refused.
+    """Return handlers that refuse the commands that change something, and carry out the others.
 
     Args:
-        handlers: of all commands.
-        control_path: the socket that carries them out, whose group the refusal names.
+        handlers: handlers of all commands.
+        control_path: the control socket, whose group the refusal names.
     """
     return {
         name: handler if name in READING else partial(_refuse, name, control_path) for name, handler in handlers.items()
@@ -229,5 +244,5 @@ def reading_only(handlers: Mapping[str, Handler], control_path: Path) -> dict[st
 
 def _refuse(command: str, control_path: Path, _arguments: Mapping[str, Any]) -> NoReturn:
     raise CommandError(
-        f"you may look and not change anything, as {command} does: {how_to_be_let_in(control_path)}", REFUSED
+        f"you may view the state but not change anything, as {command} does; {how_to_be_let_in(control_path)}", REFUSED
     )

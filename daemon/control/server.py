@@ -1,7 +1,7 @@
-"""The daemon's side of the control socket: takes clients on, and never stops doing so.
+"""The server of the control socket, which keeps accepting clients whatever fails.
 
-One thread accepts, and one for each client reads its requests and carries them out, so that a slow command stops no
-other. A client that only waits, that leaves a request unfinished or that does not read its answers is closed.
+One thread accepts connections. One thread per client reads its requests and carries them out, so that a slow command
+delays no other client. A client that is idle, leaves a request unfinished or does not read its answers is disconnected.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ from drivers.clock import NS_PER_S, SystemClock
 
 log = logging.getLogger(__name__)
 
-POLL_S = 0.5  # how often the socket's file is looked after while no one connects
-PAUSE_S = 0.2  # after an accept that failed: what it lacks will be lacking a moment longer
+POLL_S = 0.5  # how often the socket's file is checked while no one connects
+PAUSE_S = 0.2  # pause after a failed accept: the missing resource will be missing a moment longer
 CLOSE_S = 5.0
 RECEIVED_BYTES = 1 << 16
-# Passes by itself, or is the client's own doing; anything else is a fault of the socket.
+# Errors that pass by themselves or are caused by the client; any other error is a fault of the socket.
 _PASSING = LACKING | {errno.ECONNABORTED, errno.EINTR}
 _CREDENTIALS = struct.Struct("3i")  # struct ucred of unix(7): pid, uid, gid
 _NO_LISTENER = frozenset({errno.ECONNREFUSED, errno.ENOENT})
@@ -42,14 +42,14 @@ _NO_LISTENER = frozenset({errno.ECONNREFUSED, errno.ENOENT})
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits on the clients of a server and its waits for them; a command may take as long as it likes.
+    """Limits on the number of clients and on waiting for them; the duration of a command is not limited.
 
     Attributes:
-        clients: at a time.
-        line_s: for the end of a request that has begun.
-        idle_s: for the begin of the next request.
-        send_s: for an answer to be read.
-        give_way_s: a client that has waited this long without a whole request gives way when all places are taken.
+        clients: largest number of clients at a time.
+        line_s: wait for the end of a request that has begun.
+        idle_s: wait for the start of the next request.
+        send_s: wait for an answer to be read.
+        give_way_s: when all places are taken, a client that has sent no complete request for this long is disconnected.
     """
 
     clients: int = 32
@@ -64,8 +64,8 @@ class _Client:
     """A connection.
 
     Attributes:
-        waiting_ns: since when its next request is waited for; None while a command is carried out.
-        received: bytes that no request was made of yet.
+        waiting_ns: when the wait for its next request began; None while a command is carried out.
+        received: bytes of requests that are not yet parsed.
     """
 
     connection: socket.socket
@@ -78,16 +78,16 @@ class ControlServer:
     """Serves commands on a unix socket.
 
     Args:
-        path: the socket; a file that a killed daemon left behind is replaced.
-        handlers: command name -> function of the arguments, returning something JSON can hold.
-        group: whose members may connect; those of the process's own group when None.
-        limits: on its clients.
+        path: the socket; a file left behind by a killed daemon is replaced.
+        handlers: command name -> function of the arguments that returns a value JSON can represent.
+        group: group whose members may connect; the process's own group when None.
+        limits: limits on its clients.
 
     Attributes:
         path: the socket.
 
     Raises:
-        CommandError: the socket cannot be made there, or another process listens on it.
+        CommandError: the socket cannot be created there, or another process listens on it.
     """
 
     def __init__(
@@ -106,14 +106,14 @@ class ControlServer:
         self._acceptor.start()
 
     def alive(self, within_s: float) -> bool:
-        """Return True if the thread that accepts clients has come round within the last `within_s`."""
+        """Return True if the thread that accepts clients has completed a loop within the last `within_s` seconds."""
         age_ns = self._clock.monotonic_ns() - self._alive_ns
         return self._acceptor.is_alive() and age_ns <= within_s * NS_PER_S
 
     def trouble(self) -> str | None:
-        """Return why no one can connect just now, in a clause; None where all is well."""
+        """Return why no one can connect at present, in a clause; None if clients can connect."""
         if not self._acceptor.is_alive():
-            return f"the thread that takes clients at {self.path} has ended"
+            return f"the thread that accepts clients at {self.path} has ended"
         return self._trouble
 
     def close(self) -> None:
@@ -136,12 +136,12 @@ class ControlServer:
     # ---- the socket --------------------------------------------------------------------------------------------------
 
     def _bind(self) -> tuple[socket.socket, tuple[int, int] | None]:
-        """Return a new listening socket, and which file it is."""
+        """Return a new listening socket, and the identity of its file."""
         try:
             if self.path.is_socket():
                 if _is_served(self.path):
                     raise CommandError(
-                        f"another process listens at {self.path}; stop it, or give this daemon another `socket`",
+                        f"another process listens at {self.path}; stop it, or give this daemon a different `socket`",
                         FAILED,
                     )
                 self.path.unlink()
@@ -167,14 +167,14 @@ class ControlServer:
         return listener, _identity(self.path)
 
     def _unmade(self, error: OSError) -> CommandError:
-        return CommandError(f"the control socket {self.path} cannot be made: {error.strerror}", FAILED)
+        return CommandError(f"the control socket {self.path} cannot be created: {error.strerror}", FAILED)
 
     def _keep_bound(self) -> None:
-        """Bind the socket anew where its file was removed or replaced: no client would ever find it again."""
+        """Bind the socket again if its file was removed or replaced, because clients could no longer find it."""
         if _identity(self.path) == self._file:
             return
         listener, self._file = self._bind()
-        log.warning("the control socket %s was removed or replaced; it is made anew", self.path)
+        log.warning("the control socket %s was removed or replaced; it was created again", self.path)
         self._listener.close()
         self._listener = listener
 
@@ -190,11 +190,11 @@ class ControlServer:
             except CommandError as error:
                 trouble = str(error)
             except OSError as error:
-                trouble = f"the control socket {self.path} takes no client: {error.strerror}"
+                trouble = f"the control socket {self.path} cannot accept clients: {error.strerror}"
                 is_passing = error.errno in _PASSING
             except Exception as error:
                 log.exception("the control socket has failed")
-                trouble = f"the control socket {self.path} takes no client: {error}"
+                trouble = f"the control socket {self.path} cannot accept clients: {error}"
                 is_passing = False
             if self._stopping.is_set():
                 break
@@ -210,9 +210,9 @@ class ControlServer:
             return
         self._trouble = trouble
         if trouble is None:
-            log.warning("the control socket %s serves again", self.path)
+            log.warning("the control socket %s accepts clients again", self.path)
         else:
-            log.error("%s; it is tried again", trouble)
+            log.error("%s; retrying", trouble)
 
     # ---- clients -----------------------------------------------------------------------------------------------------
 
@@ -224,19 +224,19 @@ class ControlServer:
             if not is_full:
                 self._clients.add(client)
         if is_full:
-            _turn_away(connection, f"the daemon serves {self._limits.clients} clients already; try again in a moment")
+            _turn_away(connection, f"the daemon already serves {self._limits.clients} clients; try again in a moment")
             return
         client.thread = threading.Thread(target=self._serve, args=(client,), name="control-client", daemon=True)
         try:
             client.thread.start()
-        except RuntimeError:  # the system has no thread to give
+        except RuntimeError:  # the system cannot start a thread
             client.thread = None
             with self._lock:
                 self._clients.discard(client)
-            _turn_away(connection, "the daemon's computer has no thread left for a client; try again in a moment")
+            _turn_away(connection, "the daemon's computer cannot start a thread for a client; try again in a moment")
 
     def _make_room(self, now_ns: int) -> bool:
-        """Close the client that has waited longest for nothing; False where every one is at work, or has just come."""
+        """Disconnect the client that has been idle longest; return False if all are busy or have just connected."""
         give_way_ns = now_ns - int(self._limits.give_way_s * NS_PER_S)
         idle = [(c.waiting_ns, c) for c in self._clients if c.waiting_ns is not None and c.waiting_ns <= give_way_ns]
         if not idle:
@@ -263,7 +263,7 @@ class ControlServer:
                 self._clients.discard(client)
 
     def _next_line(self, client: _Client) -> bytes | None:
-        """Return the client's next request; None when it has closed, given way, or kept the server waiting."""
+        """Return the client's next request; None if the client has closed, was disconnected or exceeded a limit."""
         began_ns = self._clock.monotonic_ns()
         with self._lock:
             client.waiting_ns = began_ns
@@ -303,7 +303,7 @@ class ControlServer:
             if handler is None:
                 raise CommandError(f"unknown command {command!r:.80}; known: {', '.join(sorted(self._handlers))}")
             if command not in READING:
-                log.info("%s, asked for by %s%s", command, caller, _on_behalf(arguments))
+                log.info("%s, requested by %s%s", command, caller, _on_behalf(arguments))
             with acting_for(caller, has_left):
                 return answer_line(handler(arguments))
         except CommandError as error:
@@ -319,7 +319,7 @@ class ControlServer:
 
 
 def _on_behalf(arguments: Mapping[str, Any]) -> str:
-    """Return the operator whom a command names, as the end of a line of the log."""
+    """Return the operator named in a command, as the end of a log line."""
     operator = arguments.get(OPERATOR)
     return f" for {shown(operator, 100)}" if isinstance(operator, str) and operator else ""
 
@@ -330,14 +330,14 @@ def _hang_up(client: _Client) -> None:
 
 
 def _turn_away(connection: socket.socket, why: str) -> None:
-    """Tell a client why it is not served, if it can be told at once, and close."""
+    """Send a client the reason why it is not served, if that does not block, and close the connection."""
     with connection, contextlib.suppress(OSError):
         connection.setblocking(False)
         connection.send(refusal_line(why, FAILED))
 
 
 def _identity(path: Path) -> tuple[int, int] | None:
-    """Return device and inode of the file at `path`; None where there is none."""
+    """Return device and inode of the file at `path`; None if there is no file."""
     try:
         found = os.stat(path)
     except OSError:
@@ -353,14 +353,14 @@ def _is_served(path: Path) -> bool:
 
 
 def _is_closed_by_peer(connection: socket.socket) -> bool:
-    """Return True if the other end of a unix socket is closed; one that has only ended its requests still listens."""
+    """Return True if the peer of a unix socket has closed it; a peer that has only shut down sending still listens."""
     poll = select.poll()
     poll.register(connection, 0)  # POLLHUP is always reported
     return any(state & select.POLLHUP for _, state in poll.poll(0))
 
 
 def _peer_of(connection: socket.socket) -> Caller:
-    """Return the process that has connected a unix socket (SO_PEERCRED)."""
+    """Return the process that has connected to a unix socket (SO_PEERCRED)."""
     pid, uid, _ = _CREDENTIALS.unpack(connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size))
     try:
         user = pwd.getpwuid(uid).pw_name

@@ -1,4 +1,4 @@
-"""Threads that an error has ended: nobody waits for most threads, so nobody would miss one."""
+"""Threads that an error has ended: most threads are never joined, so their end would go unnoticed."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ log = logging.getLogger(__name__)
 
 
 def log_thread_end(end: threading.ExceptHookArgs) -> None:
-    """Tell the log of a thread's end, as `threading.excepthook`."""
+    """Log the end of a thread by an error; for use as `threading.excepthook`."""
     if _is_fault(end):
         log.critical("thread %s has ended", _name(end), exc_info=end.exc_value)
 
 
 class EndedThreads:
-    """Notes, while its block runs, which threads of the process end by an error that they do not catch.
+    """Records, while its block runs, which threads of the process end by an uncaught error.
 
-    What was told of such an end before, as in the log, is told all the same.
+    The previous `threading.excepthook`, which logs such an end, is still called.
     """
 
     def __init__(self) -> None:
@@ -37,7 +37,7 @@ class EndedThreads:
         threading.excepthook = self._tell
 
     def found(self) -> Mapping[str, str]:
-        """Return the name of each thread that has ended so -> its error, a clause; from any thread."""
+        """Return the name of each thread that an error has ended -> the error, a clause; for any thread to call."""
         return dict(self._ended)
 
     def _note(self, end: threading.ExceptHookArgs) -> None:
@@ -47,7 +47,7 @@ class EndedThreads:
 
 
 def _is_fault(end: threading.ExceptHookArgs) -> bool:
-    return not issubclass(end.exc_type, SystemExit)  # which is the way to end a thread on purpose
+    return not issubclass(end.exc_type, SystemExit)  # SystemExit ends a thread on purpose
 
 
 def _name(end: threading.ExceptHookArgs) -> str:

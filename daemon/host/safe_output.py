@@ -1,4 +1,4 @@
-"""Text, JSON and files as they leave the process: safe to show, readable by all, whole or not there at all."""
+"""Output of the process: text that is safe to show, JSON that any parser reads, and files written atomically."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _UNSAFE = frozenset({"Cc", "Cf", "Cs", "Co", "Cn", "Zl", "Zp"})
 
 
 def shown(text: object, most: int = MOST_CHARACTERS) -> str:
-    """Return `text` on one line, with unsafe characters escaped as Python writes them and at most `most` characters."""
+    """Return `text` on one line, with unsafe characters escaped as in Python, cut off after `most` characters."""
     text = str(text)
     if len(text) > most:
         text = f"{text[:most]}..."
@@ -30,12 +30,12 @@ def shown(text: object, most: int = MOST_CHARACTERS) -> str:
 
 
 def shown_lines(text: str) -> str:
-    """Return text of several lines, each of them safe to show."""
+    """Return a text of several lines with each line made safe to show."""
     return "\n".join(shown(line) for line in text.split("\n"))
 
 
 def duration(seconds: float) -> str:
-    """Return a length of time for people: `40 s`, `12 min`, `3.2 h`, `5 days`."""
+    """Return a duration in readable form: `40 s`, `12 min`, `3.2 h`, `5 days`."""
     seconds = max(seconds, 0.0)
     if seconds < 120:
         return f"{seconds:.0f} s"
@@ -47,7 +47,7 @@ def duration(seconds: float) -> str:
 
 
 def json_line(result: Mapping[str, Any]) -> str:
-    """Return one JSON object on one line; numbers that JSON does not know (NaN, infinity) become null."""
+    """Return a JSON object on one line; numbers that JSON cannot represent (NaN, infinity) become null."""
     return json.dumps(_finite(result), allow_nan=False)
 
 
@@ -62,17 +62,21 @@ def _finite(value: Any) -> Any:
 
 
 def write_file(path: Path, data: bytes) -> None:
-    """Write a file whole or not at all: beside it, flushed to disk, renamed. A link's target is written.
+    """Write a file atomically: to a temporary file in its directory, flushed to disk, then renamed.
+
+    Args:
+        path: the file; if it is a symbolic link, the link's target is written.
+        data: its new content.
 
     Raises:
-        OSError: `path` names something that is no regular file (a device, a pipe, a directory), its directory is
-            missing, or the file system refuses.
+        OSError: `path` is not a regular file (a device, a pipe, a directory), its directory is missing, or the file
+            system refuses.
     """
     path = path.resolve()
     if path.exists() and not path.is_file():
-        raise OSError(errno.EINVAL, "is not a regular file; name another", str(path))
+        raise OSError(errno.EINVAL, "is not a regular file; name a different one", str(path))
     if not path.parent.is_dir():
-        raise OSError(errno.ENOENT, "its directory does not exist; make it, or name another", str(path))
+        raise OSError(errno.ENOENT, "its directory does not exist; create it, or name a different one", str(path))
     scratch = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         with scratch.open("wb") as file:

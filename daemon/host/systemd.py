@@ -1,7 +1,7 @@
-"""systemd: log lines with a priority for its journal, what its sandbox forbids, its readiness and watchdog protocol.
+"""systemd: log lines with a priority for its journal, hints on its sandbox, its readiness and watchdog protocol.
 
-A log line may quote an instrument, a file or a client. So unsafe characters are escaped, a message is one line, and the
-lines of a traceback are indented: nothing that is quoted looks like a line of its own.
+A log line may quote an instrument, a file or a client. Therefore unsafe characters are escaped, a message is one line,
+and the lines of a traceback are indented, so that quoted text cannot look like a separate log line.
 
 Sources: sd-daemon(3), sd_notify(3), systemd.exec(5).
 """
@@ -31,16 +31,16 @@ _PRIORITIES = {"2": logging.CRITICAL, "3": logging.ERROR, "4": logging.WARNING, 
 _LINE = re.compile(r"<([0-7])>(.*)", re.DOTALL)
 EXTEND_EVERY_S = 20.0
 EXTEND_BY_S = 60
-EXTEND_LIMIT_S = 1800.0  # a start that takes longer hangs
+EXTEND_LIMIT_S = 1800.0  # a start that takes longer is considered to hang
 
 log = logging.getLogger(__name__)
 
 
 class LineFormatter(logging.Formatter):
-    """Formats records as lines that are safe to show.
+    """Formats log records as lines that are safe to show.
 
     Args:
-        is_prefixed: each line begins with its priority, as sd-daemon(3) has it, and has no time stamp.
+        is_prefixed: each line begins with its priority as in sd-daemon(3), and has no timestamp.
     """
 
     def __init__(self, *, is_prefixed: bool) -> None:
@@ -61,11 +61,11 @@ class LineFormatter(logging.Formatter):
 
 
 def set_up_logging(*, level: int = logging.INFO, is_prefixed: bool | None = None) -> None:
-    """Send log records, warnings of libraries and exceptions that no one catches to standard error.
+    """Send log records, warnings of libraries and uncaught exceptions of threads to standard error.
 
     Args:
-        level: the least important that are sent.
-        is_prefixed: each line begins with its priority; None where standard error is to be looked at.
+        level: lowest level that is sent.
+        is_prefixed: each line begins with its priority; None for True if standard error is the journal.
     """
     handler = logging.StreamHandler()
     handler.setFormatter(LineFormatter(is_prefixed=is_journal(sys.stderr) if is_prefixed is None else is_prefixed))
@@ -75,7 +75,7 @@ def set_up_logging(*, level: int = logging.INFO, is_prefixed: bool | None = None
 
 
 def is_journal(stream: TextIO) -> bool:
-    """Return whether a stream goes to the journal: it is what JOURNAL_STREAM names (systemd.exec(5))."""
+    """Return True if a stream goes to the journal: it is the one that JOURNAL_STREAM names (systemd.exec(5))."""
     try:
         found = os.fstat(stream.fileno())
     except (OSError, ValueError, AttributeError):
@@ -84,15 +84,15 @@ def is_journal(stream: TextIO) -> bool:
 
 
 def priority_prefix(level: int) -> str:
-    """Return the prefix that tells the journal how important a line is."""
+    """Return the prefix that gives a line's priority to the journal."""
     priority = next((p for p, least in _PRIORITIES.items() if level >= least), "7")
     return f"<{priority}>"
 
 
 def parse_line(line: str) -> tuple[int, str]:
-    """Return the level and the text of a line that may begin with a priority; without one it counts as a warning.
+    """Return the level and the text of a line that may begin with a priority; without one it is a warning.
 
-    What a library prints on standard error has none, and it is seldom good news.
+    Output of a library on standard error has no priority, and usually reports a problem.
     """
     found = _LINE.match(line)
     if found is None:
@@ -101,23 +101,23 @@ def parse_line(line: str) -> tuple[int, str]:
 
 
 def network_hint(error: object, environ: Mapping[str, str] = os.environ) -> str:
-    """Return what to do where the service's unit forbids a connection; "" for any other error and outside a service."""
+    """Return a hint where the service's unit forbids a connection; "" for any other error and outside a service."""
     is_forbidden = isinstance(error, socket.gaierror) or (
         isinstance(error, OSError) and error.errno in (errno.EAFNOSUPPORT, errno.EPERM)
     )
-    if not is_forbidden or "INVOCATION_ID" not in environ:  # of each service, systemd.exec(5)
+    if not is_forbidden or "INVOCATION_ID" not in environ:  # set for each service, systemd.exec(5)
         return ""
-    return " (the service has no network unless network.conf opens it: `The network` in deploy/README.md)"
+    return " (the service has no network unless network.conf allows it: see `The network` in deploy/README.md)"
 
 
 # ---- readiness and watchdog ----------------------------------------------------------------------------------------
 
 
 class Notifier:
-    """Tells systemd how the service is; does nothing when not started by systemd.
+    """Reports the state of the service to systemd; does nothing when not started by systemd.
 
     Args:
-        environ: where NOTIFY_SOCKET and WATCHDOG_USEC are looked up.
+        environ: the environment, with NOTIFY_SOCKET and WATCHDOG_USEC.
     """
 
     def __init__(self, environ: os._Environ[str] | dict[str, str] = os.environ) -> None:
@@ -125,7 +125,7 @@ class Notifier:
         self._address = "\0" + address[1:] if address.startswith("@") else address
         self._is_heard = True
         if self._address:
-            # Opened once: a beat must not need a descriptor when there are none left.
+            # Opened once: a heartbeat must not need a descriptor when there are none left.
             self._channel = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
             weakref.finalize(self, self._channel.close)
         usec = environ.get("WATCHDOG_USEC", "")
@@ -133,23 +133,23 @@ class Notifier:
         self.watchdog_s = int(usec) / 1e6 if usec.isdigit() and own else None
 
     def send(self, *states: str) -> None:
-        """Send states such as `READY=1`, `STOPPING=1`, `WATCHDOG=1`, `STATUS=...`; one that is lost is logged."""
+        """Send states such as `READY=1`, `STOPPING=1`, `WATCHDOG=1`, `STATUS=...`; a failure to send is logged."""
         if not self._address:
             return
         try:
             self._channel.sendto("\n".join(map(shown, states)).encode(), self._address)
         except OSError as error:
             if self._is_heard:
-                log.warning("the service manager is not reached at %s: %s", self._address, error.strerror)
+                log.warning("the service manager cannot be reached at %s: %s", self._address, error.strerror)
             self._is_heard = False
         else:
             self._is_heard = True
 
     @contextlib.contextmanager
     def extending(self, status: str) -> Iterator[None]:
-        """While the block runs, systemd waits for READY beyond its TimeoutStartSec.
+        """Extend systemd's TimeoutStartSec while the block runs.
 
-        A store that a new version brings up to date, or that a power cut left with a long log, takes its time to open.
+        A store takes long to open if a new version migrates it, or if a power cut left a long write-ahead log.
 
         Args:
             status: what is being done, for `systemctl status`.

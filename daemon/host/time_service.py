@@ -1,8 +1,8 @@
-"""State of the computer's clock, as its time service and its kernel tell it: read, never set.
+"""State of the computer's clock, as its time service and its kernel report it: read, never set.
 
-The kernel says whether a time service (chrony, systemd-timesyncd, ntpd) keeps the clock, and how far off it may be.
-chrony also says by how much the clock is off at present. A service's sandbox may forbid both; then a unit that systemd
-starts for a connection reads them (`rigcal-clock@.service`), which is this module as a program.
+The kernel reports whether a time service (chrony, systemd-timesyncd, ntpd) synchronises the clock, and its greatest
+possible error. chrony also reports the present offset. A service's sandbox may forbid both; then a unit that systemd
+starts for each connection (`rigcal-clock@.service`) reads them, with this module as its program.
 
 Sources: adjtimex(2); chronyc(1), tracking; ntp_adjtime(3).
 """
@@ -25,7 +25,7 @@ _STA_PLL, _STA_UNSYNC, _STA_NANO = 0x0001, 0x0040, 0x2000
 _TIMEOUT_S = 10.0
 _CHRONYC = ("chronyc", "-n", "-c", "tracking")
 _CHRONYC_S = 3.0
-_ITSELF = "7F7F0101"  # reference of a computer that serves its own time to others (`local`)
+_ITSELF = "7F7F0101"  # reference id of a computer that serves its own unsynchronised time (`local`)
 _SYSTEM_TIME, _ROOT_DELAY, _ROOT_DISPERSION, _LEAP_STATUS = 4, 10, 11, 13  # fields of chronyc's line
 
 
@@ -34,11 +34,11 @@ class ClockState:
     """State of the computer's clock.
 
     Attributes:
-        is_synchronized: whether a time service keeps the clock; None where nothing tells.
-        offset_s: by how much the clock is ahead of the time service's estimate; None where that is not told.
-        max_error_s: greatest error that the clock may have; None where it is not synchronised, or not told.
-        source: who tells: `chrony`, `kernel`, or "" where nobody does.
-        error: why nobody tells; "" where somebody does.
+        is_synchronized: whether a time service synchronises the clock; None where unknown.
+        offset_s: by how much the clock is ahead of the time service's estimate; None where unknown.
+        max_error_s: greatest error that the clock may have; None where it is not synchronised, or unknown.
+        source: source of the state: `chrony`, `kernel`, or "" where there is none.
+        error: why there is no source; "" where there is one.
     """
 
     is_synchronized: bool | None
@@ -68,7 +68,7 @@ def clock_state(socket_path: str | None = None) -> ClockState:
     """Return the state of the clock.
 
     Args:
-        socket_path: where to ask if the kernel may not be asked.
+        socket_path: socket to read the state from if the sandbox forbids the system call.
     """
     try:
         state = _of_kernel()
@@ -87,15 +87,15 @@ def _of_kernel() -> ClockState:
         raise OSError(number, os.strerror(number))
     if timex.status & _STA_UNSYNC:
         return ClockState(False, source="kernel")
-    # Left to be slewed, where the kernel slews; a service that does it itself leaves 0 here, which says nothing.
+    # The offset is the part still to be slewed by the kernel; a service that slews by itself leaves 0 here.
     is_slewed = bool(timex.status & _STA_PLL)
     unit_s = 1e-9 if timex.status & _STA_NANO else 1e-6
-    offset_s = 0.0 - timex.offset * unit_s if is_slewed else None  # the kernel adds it
+    offset_s = 0.0 - timex.offset * unit_s if is_slewed else None  # the kernel adds timex.offset to the clock
     return ClockState(True, offset_s, timex.maxerror * 1e-6, "kernel")
 
 
 def _of_chrony(kernel: ClockState) -> ClockState:
-    """Return what chrony tells, where it runs; else what the kernel does."""
+    """Return the state reported by chrony where it runs, otherwise the kernel's."""
     try:
         done = subprocess.run(_CHRONYC, capture_output=True, text=True, timeout=_CHRONYC_S, check=True)
         return parse_tracking(done.stdout)
@@ -104,21 +104,21 @@ def _of_chrony(kernel: ClockState) -> ClockState:
 
 
 def parse_tracking(line: str) -> ClockState:
-    """Return the state in the line that `chronyc -c tracking` prints.
+    """Parse the line that `chronyc -c tracking` prints.
 
     Raises:
-        ValueError, IndexError: it is no such line.
+        ValueError, IndexError: the line has a different form.
     """
     fields = line.strip().split(",")
     if fields[_LEAP_STATUS] == "Not synchronised" or fields[0] == _ITSELF:
         return ClockState(False, source="chrony")
-    offset_s = 0.0 - float(fields[_SYSTEM_TIME])  # chrony tells the correction: positive where the clock is slow
+    offset_s = 0.0 - float(fields[_SYSTEM_TIME])  # chrony reports the correction: positive where the clock is slow
     max_error_s = abs(offset_s) + float(fields[_ROOT_DISPERSION]) + float(fields[_ROOT_DELAY]) / 2
     return ClockState(True, offset_s, max_error_s, "chrony")
 
 
 def _asked(path: str) -> ClockState:
-    """Return what the process tells that systemd starts for a connection."""
+    """Return the state reported by the process that systemd starts for a connection."""
     try:
         with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection:
             connection.settimeout(_TIMEOUT_S)
@@ -129,7 +129,7 @@ def _asked(path: str) -> ClockState:
     except OSError as error:
         return ClockState(None, error=f"{path}: {error.strerror or error}")
     except (ValueError, TypeError):
-        return ClockState(None, error=f"{path}: no answer; `journalctl -u 'rigcal-clock@*'` tells why")
+        return ClockState(None, error=f"{path}: no answer; see `journalctl -u 'rigcal-clock@*'`")
 
 
 if __name__ == "__main__":

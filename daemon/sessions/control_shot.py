@@ -1,4 +1,4 @@
-"""A control point being measured: the mean of the next good fixes of a standing target."""
+"""Measurement of a control point: the mean of the next good fixes of a stationary target."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from drivers.stations.survey import position_mm
 
 log = logging.getLogger(__name__)
 
-SPREAD_MM = 20.0  # fixes of one shot that lie further apart are not of one standing target
-_LOOK_S = 0.5  # how often a shot looks whether anyone still waits for it
+SPREAD_MM = 20.0  # fixes of one shot that lie further apart are not of one stationary target
+_LOOK_S = 0.5  # how often a shot checks whether its caller is still connected
 
 
 @dataclass
@@ -25,11 +25,11 @@ class Shot:
     """One shot of a control point.
 
     Attributes:
-        wanted: how many.
+        wanted: number of fixes needed.
         since, until: fixes measured in between are not of the prism.
-        aimed: fixes measured from then on may be of the point; None until the station was told to turn to it.
-        fixes, places_mm: so far.
-        done: when there are enough.
+        aimed: fixes measured from this instant on may be of the point; None until the station was told to turn to it.
+        fixes, places_mm: fixes so far, and their places in the station's frame.
+        done: completed once there are enough fixes.
     """
 
     wanted: int
@@ -41,14 +41,14 @@ class Shot:
     done: Future[None] = field(default_factory=Future)
 
     def take(self, fix: Fix, order: Order) -> None:
-        """Take a fix, in the order of time, if it is of the point; the last one that is wanted completes the shot."""
+        """Add a fix, in order of time, if it is of the point; the last fix needed completes the shot."""
         place_mm = position_mm(fix)
         if self.done.done() or place_mm is None or fix.status is not Status.OK:
             return
         if not lies_within(order, fix.stamp, self.aimed, None):
             return
         if self.places_mm and math.dist(place_mm, self.places_mm[0]) > SPREAD_MM:
-            self.fixes.clear()  # the station was still turning to it
+            self.fixes.clear()  # the station was still turning to the point
             self.places_mm.clear()
         self.fixes.append(fix)
         self.places_mm.append(place_mm)
@@ -56,12 +56,17 @@ class Shot:
             self.done.set_result(None)
 
     def wait(self, clock: Clock, timeout_s: float) -> None:
-        """Wait until the shot is complete; the time-out runs on the clock of the rig.
+        """Wait until the shot is complete.
 
-        An operator who gives up turns the station back to the prism: a shot that nobody waits for ends at once.
+        If the caller disconnects, the shot is cancelled, because an operator who cancels turns the station back to the
+        prism.
+
+        Args:
+            clock: clock of the rig, on which the timeout runs.
+            timeout_s: longest wait.
 
         Raises:
-            CommandError: nobody waits any more, or too few good fixes came.
+            CommandError: the caller has disconnected, or too few good fixes were measured.
         """
         arrived = threading.Event()
         self.done.add_done_callback(lambda _: arrived.set())
@@ -70,11 +75,11 @@ class Shot:
             is_complete = clock.wait(arrived, min(left_s, _LOOK_S))
             left_s -= _LOOK_S
             if caller_has_left():
-                log.info("a shot of a control point was given up: nobody waits for it any more")
-                raise CommandError("the shot was given up, and nothing was stored", FAILED)
+                log.info("a shot of a control point was cancelled: its caller has disconnected")
+                raise CommandError("the shot was cancelled, and nothing was stored", FAILED)
         if not is_complete:
             raise CommandError(
-                f"{len(self.fixes)} of {self.wanted} good fixes within {timeout_s:g} s; is the station aimed at the "
-                "control point, and locked? `rigcal status` shows",
+                f"only {len(self.fixes)} of {self.wanted} good fixes within {timeout_s:g} s; check with "
+                "`rigcal status` that the station is aimed at the control point and locked",
                 FAILED,
             )

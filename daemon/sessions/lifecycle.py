@@ -1,9 +1,11 @@
-"""Every way in which a calibration session changes its state, and whether calibration may use it.
+"""All changes of a calibration session's state, and the decision whether calibration may use it.
 
-A session is open, then closed or aborted. When it is closed it is decided whether calibration may use it: where no
-control point shows that the station stood still from its start to its end, it may not, until an operator accepts it;
-where another rig file than today's turned counts into its readings, it may not as long as that file is not in use; and
-where an encoder has jumped since, as long as nobody has checked the joint's zero.
+A session is open, then closed or aborted. When it is closed, it is decided whether calibration may use it. It may not
+
+- if no control point shows that the station stood still from its start to its end, until an operator accepts it;
+- if a rig file other than the present one converted counts into its readings, until that file is in use again;
+- if an encoder has jumped since, until the joint's zero has been checked.
+
 Each change is one transaction.
 """
 
@@ -31,13 +33,13 @@ from drivers.clock import Clock, Stamp
 
 log = logging.getLogger(__name__)
 
-NOT_SHOT = "no control point was shot at its start and again at its end, so nothing shows that the station stood still"
-NOT_ENCLOSED = "most of its poses do not lie between a control point's shots at its start and at its end"
+NOT_SHOT = "no control point was shot at both start and end, so nothing shows that the station stood still"
+NOT_ENCLOSED = "most poses do not lie between a control point's shot at the session's start and its shot at the end"
 NOT_THE_SAME = (
-    "the control point that was shot at its start was not shot at its end, and another one was, whose first shot came "
-    "after some poses: those may have been measured from another place"
+    "the control point shot at the session's start was not shot again at its end; the control point shot at the end "
+    "was first shot after some poses, and the station may have moved before that"
 )
-LEAST_ENCLOSED = 0.25  # of its poses; some come before the operator gets to the first shot, or after the last
+LEAST_ENCLOSED = 0.25  # share of the poses; some are measured before the first shot or after the last one
 
 
 class SessionLifecycle:
@@ -45,13 +47,13 @@ class SessionLifecycle:
 
     Args:
         store: the database.
-        rig: whose sessions are opened.
-        clock: time of the changes.
-        tolerance_mm: a control point further off than this says that the station moved.
-        clock_state: returns how the computer's clock is; None where it is not that of the session.
+        rig: rig whose sessions are opened.
+        clock: clock for the instants of changes.
+        tolerance_mm: a control point that is off by more than this shows that the station has moved.
+        clock_state: returns the state of the computer's clock; None if the session uses a different clock.
 
     Attributes:
-        table: of the sessions.
+        table: the sessions.
     """
 
     def __init__(
@@ -68,10 +70,13 @@ class SessionLifecycle:
         self._jobs = JobTable(store, rig.name)
 
     def unfinished(self, rig_text: str) -> tuple[OpenSession | None, list[OpenSession]]:
-        """The rig's open session, and those that have ended and whose last captures were not decoded yet.
+        """Return the rig's open session, and ended sessions whose last captures are not yet decoded.
 
-        A session is of one rig file: one that was started with another is closed, and gets no more fixes. One that has
-        the file alone, as the store kept it before it kept the decoding of channels, goes on.
+        A session belongs to one rig file. A session started with a different file is closed, and gets no more fixes. A
+        session stored with the bare file, from before the store kept the decoding of channels, continues.
+
+        Args:
+            rig_text: the present rig file with the decoding of channels.
         """
         opened: OpenSession | None = None
         ended: list[OpenSession] = []
@@ -81,7 +86,7 @@ class SessionLifecycle:
             if row["rig"] != self._rig.name:
                 if row["state"] == "open":
                     log.warning(
-                        "session %s of rig %s is open; it goes on when rigcal runs that rig", row["id"], row["rig"]
+                        "session %s of rig %s is open; it continues when rigcal runs that rig", row["id"], row["rig"]
                     )
                 continue
             if row["rig_sha256"] not in own:
@@ -98,7 +103,7 @@ class SessionLifecycle:
         return opened, ended
 
     def _close_of_another_file(self, row: Mapping[str, Any]) -> None:
-        """Close a session that was open when the last run ended, as of then, since the rig's file has changed."""
+        """Close a session left open by the last run, as of that run's end, because the rig file has changed."""
         why = "closed by rigcal: the rig file was changed while it was open"
         last = self._store.previous_end or self._clock.now()
         ended = max(self._store.stamp(row, "started_"), last, key=self._store.order)
@@ -110,10 +115,10 @@ class SessionLifecycle:
                 excluded=self._why_not_used(row["id"]),
                 **self._store.instant(ended, "ended_"),
             )
-        log.warning("session %s (prism %s): %s; start another one", row["id"], row["prism"], why)
+        log.warning("session %s (prism %s): %s; start a new session", row["id"], row["prism"], why)
 
     def jumped(self, session: OpenSession) -> dict[str, Stamp]:
-        """Devices whose encoders have jumped in a session, since when."""
+        """Return the devices whose encoders jumped during a session, each with the instant of its first jump."""
         jumped: dict[str, Stamp] = {}
         for jump in preset_jumps(self._store, session.since):
             if session.lasted(jump.at):
@@ -121,7 +126,14 @@ class SessionLifecycle:
         return jumped
 
     def start(self, started: Stamp, session_id: str, rig_text: str, **columns: object) -> None:
-        """Add an open session of the rig, which its file describes."""
+        """Add an open session.
+
+        Args:
+            started: start of the session.
+            session_id: its id.
+            rig_text: the rig file with the decoding of channels.
+            columns: further columns of its row.
+        """
         with self._store.transaction():
             self.table.start(started, rig_text, id=session_id, **columns)
             self._note_clock(session_id, "start")
@@ -134,29 +146,33 @@ class SessionLifecycle:
     def end(self, session_id: str, state: str) -> Stamp:
         """Close or abort a session.
 
+        Args:
+            session_id: the session.
+            state: `closed` or `aborted`.
+
         Returns:
-            When: no fix that was measured later is stored as its observation.
+            Instant of its end: fixes measured later are not stored as its observations.
         """
         with self._store.transaction():
-            ended = self._clock.now()  # in the transaction: the writer's thread may have held the store for long
+            ended = self._clock.now()  # in the transaction: the writer thread may have held the store for a long time
             excluded = self._why_not_used(session_id) if state == "closed" else None
             self.table.change(session_id, state=state, excluded=excluded, **self._store.instant(ended, "ended_"))
             self._note_clock(session_id, "end")
         return ended
 
     def judge_again(self, session_id: str) -> None:
-        """Decide anew whether calibration may use a closed session, of which more was decoded after its end."""
+        """Decide again whether calibration may use a closed session of which more was decoded after its end."""
         with self._store.transaction():
             self.table.exclude_closed(session_id, self._why_not_used(session_id))
 
     def judge_readings(self) -> None:
-        """Decide anew whether calibration may use the closed sessions: rig file or zeros may be others than theirs."""
+        """Decide again whether calibration may use the closed sessions: the rig file or zeros may have changed."""
         with self._store.transaction():
             for row in self.table.closed():
                 self._judge_readings(row)
 
     def judge_zeros(self) -> None:
-        """Decide anew whether calibration may use closed sessions: an encoder has jumped, maybe once again."""
+        """Decide again whether calibration may use the closed sessions, after an encoder has jumped."""
         with self._store.transaction():
             for row in self.table.closed():
                 if not (row["excluded"] or "").startswith(OTHER_RIG_FILE):
@@ -180,9 +196,9 @@ class SessionLifecycle:
         return row
 
     def _why_other_readings(self, row: Mapping[str, Any]) -> str | None:
-        """Return why a session's readings are not those of the rig as it is now, a clause; None where they are.
+        """Return why a session's readings do not match the present rig, a clause; None where they match.
 
-        An operator who accepts a session says that the zeros are those that it was measured with.
+        An operator who accepts a session confirms that the zeros are the same as when it was measured.
         """
         if why := misreading(self._rig, row["rig_text"], row["prism"]):
             return f"{OTHER_RIG_FILE}{why}"
@@ -191,22 +207,26 @@ class SessionLifecycle:
         return f"{ZERO_LOST}{', '.join(joints)}" if joints else None
 
     def accept(self, session_id: str, operator: str) -> str:
-        """Let calibration use a closed session from now on, on an operator's word.
+        """Let calibration use a closed session from now on, because an operator accepts it.
+
+        Args:
+            session_id: the session.
+            operator: name of the operator; "" if unknown.
 
         Returns:
-            The reason for which it was not used.
+            The reason why it was not used.
 
         Raises:
-            CommandError: it is not closed, or it is used anyway.
+            CommandError: the session is not closed, is used already, or was recorded with a different rig file.
             NotInStoreError: there is no such session.
         """
         with self._store.transaction():
             state, despite = self.table.state_and_exclusion(session_id)
             if state != "closed":
-                why = "open; stop it first" if state == "open" else "aborted, and stays so"
-                raise CommandError(f"session {session_id!r} is {why}")
+                why = "is open; stop it first" if state == "open" else "was aborted, and cannot be accepted"
+                raise CommandError(f"session {session_id!r} {why}")
             if despite is None:
-                raise CommandError(f"session {session_id!r} is used by calibration; there is nothing to accept")
+                raise CommandError(f"session {session_id!r} is already used by calibration; there is nothing to accept")
             if despite.startswith(OTHER_RIG_FILE):
                 raise CommandError(f"session {session_id!r}: {despite}; {HOW_TO_READ_AGAIN}", REFUSED)
             self.table.change(
@@ -221,34 +241,34 @@ class SessionLifecycle:
         return despite
 
     def _why_not_used(self, session_id: str) -> str | None:
-        """Why calibration must not use a session, a clause; None where a control point shows that it may."""
+        """Return why calibration must not use a session, a clause; None if it may."""
         row = self._row(session_id)
         reasons = self._why_other_readings(row), self._why_other_constant(row), self._why_moved(session_id)
         return "; ".join(filter(None, reasons)) or None
 
     def _why_other_constant(self, row: Mapping[str, Any]) -> str | None:
-        """Return why a session's distances do not fit those of others, a clause: another prism constant was set.
+        """Return a clause if a session's prism constant differs from that of other sessions, otherwise None.
 
-        It is held against what the set-up's description says, else against the newest session that is used there.
+        The constant is compared with the one in the set-up's description, or else in the newest used session there.
         """
         said_mm = self._setups.constants_mm(row["setup_id"]).get(row["prism"])
         like = self.table.used_like(row["id"])
         for station, mm in first_constants_mm(self._store, row["id"]).items():
             if said_mm is not None:
-                other_mm, where = said_mm, f"set-up {row['setup_id']} says"
+                other_mm, where = said_mm, f"set-up {row['setup_id']} gives"
             else:
                 other_mm = mm if like is None else first_constants_mm(self._store, like).get(station, mm)
                 where = f"session {like} has"
             if abs(mm - other_mm) > CONSTANT_TOLERANCE_MM:
-                return f"{station} applied a prism constant of {mm:g} mm to {row['prism']}, and {where} {other_mm:g} mm"
+                return f"{station} applied a prism constant of {mm:g} mm to {row['prism']}, but {where} {other_mm:g} mm"
         return None
 
     def _why_moved(self, session_id: str) -> str | None:
-        """Return why a session's station may have moved, a clause; None where a control point shows that it did not."""
+        """Return why a session's station may have moved, a clause; None if a control point shows that it did not."""
         for shot in self.table.shots(session_id):
             if shot["misclosure_mm"] is not None and shot["misclosure_mm"] > self._tolerance_mm:
-                off = f"control point {shot['point']} was {shot['misclosure_mm']:.1f} mm off at its {shot['phase']}"
-                return f"{off}, so the station had moved"
+                off = f"control point {shot['point']} was {shot['misclosure_mm']:.1f} mm off at the session's"
+                return f"{off} {shot['phase']}, so the station had moved"
         again = self.table.moved_between(session_id)
         if again is not None and again[1] > self._tolerance_mm:
             return (
@@ -263,5 +283,5 @@ class SessionLifecycle:
 
 
 def _has_other_readings(closed: Mapping[str, Any]) -> bool:
-    """Return True if a session is not used since its readings are not those of the rig as it is now."""
+    """Return True if a session is not used because its readings do not match the present rig."""
     return (closed["excluded"] or "").startswith((OTHER_RIG_FILE, ZERO_LOST))

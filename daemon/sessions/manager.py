@@ -1,7 +1,7 @@
-"""Calibration sessions: what the operator says, joined with what the instruments give.
+"""Calibration sessions: the operator's commands combined with the instruments' records.
 
-All state lives in the store; this module holds only what an open session needs between two fixes, and changes it after
-the store: what the store has refused has not happened. `on_records` runs in the writer thread; methods named
+All state lives in the store. This module holds only what an open session needs between two fixes, and changes it after
+the store: a change that the store refuses has no effect. `on_records` runs in the writer thread; methods named
 `*_command` are called by the control socket's threads.
 """
 
@@ -47,8 +47,8 @@ from drivers.stations.survey import position_mm
 
 log = logging.getLogger(__name__)
 
-LOAD_S = 3.0  # how long a session's start waits for what tells prisms apart; it is heeded later as well
-LATE_NS = 60 * NS_PER_S  # once a fix was joined that was measured so long after a session's end, it has all of its own
+LOAD_S = 3.0  # how long a session's start waits for the check of prisms to load; later loading is used as well
+LATE_NS = 60 * NS_PER_S  # once a fix measured this long after a session's end is joined, all fixes of the session are
 
 
 class SessionManager:
@@ -56,20 +56,20 @@ class SessionManager:
 
     Args:
         rig, rig_text: the machine, and the file that describes it.
-        store: where everything is kept.
-        setups: the station set-ups in it.
+        store: store of sessions and observations.
+        setups: the station set-ups in the store.
         joiner: joins fixes with joints.
-        settings: tolerances and time-outs.
-        clock: time.
-        run_id: of this run of the daemon; poses are numbered within it.
-        aim: turns the station to a prism or control point where something can (a simulated rig); None where the
-            operator does it.
-        limits: station -> what motion can do to its prism.
+        settings: tolerances and timeouts.
+        clock: clock of the rig.
+        run_id: number of this run of the daemon; poses are numbered within a run.
+        aim: turns the station to a prism or control point, on a simulated rig; None where the operator does it.
+        limits: station -> limits of its prism's motion.
         are_jobs_enabled: closed sessions start jobs.
-        clock_state: returns how the computer's clock is, to be noted with a session; None where it is another clock.
+        clock_state: returns the state of the computer's clock, noted with a session; None for a different clock.
 
     Attributes:
-        turn: held while a command is carried out; whoever gives several within a transaction takes it before that.
+        turn: lock that is held while a command is carried out. A caller that runs several commands in one transaction
+            takes the lock before the transaction.
     """
 
     def __init__(
@@ -102,7 +102,7 @@ class SessionManager:
         self._observing = ObservationMaker(rig, store, self._pending, self._prisms, run_id)
         self._advice = SessionAdvice(rig, setups, self._table, self._prisms)
         self._late: set[str] = set()  # sessions that got fixes after their end, and must be judged again
-        # Fixes measured in those that have ended may still come, or wait for their joints
+        # Fixes measured in ended sessions may still arrive, or wait for their joints
         self._open: OpenSession | None = None
         self._ended: list[OpenSession] = []
         store.unless_damaged(self._go_on, None)
@@ -110,7 +110,7 @@ class SessionManager:
     # ---- the writer thread -------------------------------------------------------------------------------------------
 
     def on_records(self, records: Sequence[Record]) -> None:
-        """Take records that are stored now: complete a shot, or store observations of the open session."""
+        """Process records that have just been stored: complete a shot, or store observations of the open session."""
         has_jumped = False
         for record in records:
             if isinstance(record, Fix):
@@ -127,14 +127,14 @@ class SessionManager:
         observing = [self._observe(joined) for joined in self._joiner.feed(records)]
         late = [session.id for session in observing if session is not None and session.until is not None]
         self._late.update(late)
-        if not late:  # no more of them at present
+        if not late:  # no late fixes at present
             for session_id in self._late:
                 self._pending.add(partial(self._lifecycle.judge_again, session_id))
             self._late.clear()
         self._pending.store()
 
     def is_of_session(self, stamp: Stamp) -> bool:
-        """Return True if an instant lies in the open session, or in one that ended and may still get fixes."""
+        """Return True if an instant lies in the open session, or in an ended one that may still get fixes."""
         return any(session.lasted(stamp) for session in self._taking())
 
     def _watch_prism(self, fix: Fix) -> None:
@@ -143,12 +143,12 @@ class SessionManager:
                 self._prisms.see(session, fix)
 
     def _taking(self) -> list[OpenSession]:
-        """The sessions that may have measured what comes now, oldest first."""
+        """Return the sessions to which arriving records may belong, oldest first."""
         opened = self._open
         return [*self._ended, *([] if opened is None else [opened])]
 
     def _observe(self, joined: JoinedFix) -> OpenSession | None:
-        """Make an observation of the session in which a fix was measured, if any; that session."""
+        """Make an observation of the session in which a fix was measured, and return that session, if there is one."""
         for ended in list(self._ended):
             if ended.until is not None and lies_within(
                 self._store.order, joined.stamp, ended.until.shifted(LATE_NS), None
@@ -164,7 +164,7 @@ class SessionManager:
     # ---- sessions ----------------------------------------------------------------------------------------------------
 
     def start_command(self, arguments: Mapping[str, Any], *, is_aimed: bool = True) -> dict[str, Any]:
-        """Open a session: from now on good fixes become its observations; from `look_back` on where not `is_aimed`."""
+        """Open a session: good fixes become its observations from now on, or from `look_back` on if not `is_aimed`."""
         with self.turn:
             if self._open is not None:
                 raise CommandError(f"session {self._open.id!r} is open; {HOW_TO_END}")
@@ -175,7 +175,7 @@ class SessionManager:
                 )
             if kind not in SESSION_KINDS:
                 raise CommandError(f"there is no kind {kind!r:.80}; kinds: {', '.join(SESSION_KINDS)}")
-            self._setups.usable(arguments.get("setup"))  # before anything is waited for
+            self._setups.usable(arguments.get("setup"))  # fails before any waiting
             self._prisms.prepare(LOAD_S)
             if self._aim is not None:
                 self._aim(prism)
@@ -191,13 +191,13 @@ class SessionManager:
             }
 
     def stop_command(self, _arguments: Mapping[str, Any]) -> dict[str, Any]:
-        """Close the open session; its jobs follow by themselves."""
+        """Close the open session; its jobs start by themselves."""
         with self.turn:
             session = self._close("closed")
             return self._table.summary(session.id) | {"advice": self._advice.at_end(session)}
 
     def abort_command(self, _arguments: Mapping[str, Any]) -> dict[str, Any]:
-        """Close the open session as unusable: kept, never calibrated with."""
+        """Close the open session as unusable: it is kept, but never used for calibration."""
         with self.turn:
             return self._table.summary(self._close("aborted").id)
 
@@ -206,19 +206,21 @@ class SessionManager:
         with self.turn:
             session_id, operator = str(arguments.get("id", "")), text_argument(arguments, "operator")
             despite = self._lifecycle.accept(session_id, operator)
-            log.warning("session %s is used, by the word of %s: %s", session_id, operator or "an operator", despite)
+            log.warning(
+                "session %s is used, accepted by %s despite: %s", session_id, operator or "an operator", despite
+            )
             return self._table.summary(session_id)
 
     def shoot_command(self, arguments: Mapping[str, Any], *, most_off_mm: float = math.inf) -> dict[str, Any]:
         """Measure a control point: the mean of the next good fixes. The first shot of a point defines its place.
 
-        What lies further than `most_off_mm` from the known place is something else, and refused.
+        A target further than `most_off_mm` from the known place is not the point, and the shot is refused.
         """
         with self.turn:
             session = self._needs_open()
             name = identifier(arguments, "point", "a control point's name")
             if name in self._rig.prism_names:
-                raise CommandError(f"{name!r} is a prism of the rig; a control point stands still beside it")
+                raise CommandError(f"{name!r} is a prism of the rig; name a control point, which does not move with it")
             shot = Shot(self._settings.fixes_per_shot, self._clock.now())
             session.shots.append(shot)
             try:
@@ -237,27 +239,27 @@ class SessionManager:
             return result | {"advice": after_a_move(session.id) if result["moved"] else []}
 
     def zeros_checked(self) -> None:
-        """Decide anew whether calibration may use closed sessions: an operator has checked the joints' zeros."""
+        """Decide again whether calibration may use closed sessions, after an operator has checked the joints' zeros."""
         self._lifecycle.judge_readings()
 
     def confirm_prism_command(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
-        """Take the operator's word that the station is on the session's prism: its fixes count from now on."""
+        """Note the operator's confirmation that the station is on the session's prism; its fixes are used again."""
         with self.turn:
             return self._prisms.confirm(self._needs_open(), text_argument(arguments, "operator"))
 
     def turned_command(self, _arguments: Mapping[str, Any]) -> dict[str, Any]:
-        """In a replay: the station was turned to the session's prism at this instant."""
+        """Note, in a replay, that the station was turned to the session's prism at this instant."""
         with self.turn:
             session = self._needs_open()
             self._prisms.turned(session, self._clock.now())
             return {"session": session.id}
 
     def list_command(self, _arguments: Mapping[str, Any]) -> list[dict[str, Any]]:
-        """All sessions with what they hold, oldest first."""
+        """Return all sessions with their contents, oldest first."""
         return [session | self._without_job(session) for session in self._table.all()]
 
     def show_command(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
-        """One session: what it holds, what was excluded and why, how its set-up kept its place, and its jobs."""
+        """Return one session: its contents, its exclusions with reasons, the control points of its set-up, its jobs."""
         session_id = str(arguments.get("id", ""))
         session = self._table.summary(session_id)
         about = {
@@ -278,54 +280,54 @@ class SessionManager:
         return self._table.summary(session.id) | {"prism_suspicions": suspicions}
 
     def aim_again(self) -> None:
-        """Aim the station again when it may be on another prism, where something can."""
+        """Aim the station again if it may be on another prism and a program can aim it."""
         session = self._open
         if self._aim is None or session is None or not self._prisms.suspicions(session):
             return
-        if self.turn.acquire(blocking=False):  # else a command is at work on the session: another time
+        if self.turn.acquire(blocking=False):  # otherwise a command is working on the session: retry later
             try:
                 if session is self._open:
                     self._aim(session.prism)
                     self._prisms.turned(session, self._clock.now())
-            except (CommandError, sqlite3.Error) as error:  # another time: the station, or the disk, is not well
-                log.warning("station not aimed at prism %s again: %s", session.prism, error)
+            except (CommandError, sqlite3.Error) as error:  # a fault of the station or the disk: retry later
+                log.warning("the station could not be aimed at prism %s again: %s", session.prism, error)
             finally:
                 self.turn.release()
 
     # ---- for a guide -------------------------------------------------------------------------------------------------
 
     def look_away(self, since: Stamp | None = None, until: Stamp | None = None) -> None:
-        """Count no fix of the open session from an instant on, now by default: the station is not on its prism.
+        """Exclude fixes of the open session from an instant on, because the station is not on its prism.
 
         Args:
-            since: when it was turned away.
-            until: when it was back, where that is over already.
+            since: when the station was turned away; now by default.
+            until: when it was back on the prism, if it is already.
         """
         session = self._open
         if session is not None:
             session.shots.append(Shot(0, since or self._clock.now(), until))
 
     def look_back(self, operator: str) -> None:
-        """Count the fixes of the open session again, on an operator's word that the station is on its prism."""
+        """Use the fixes of the open session again, after an operator has confirmed that the station is on its prism."""
         session = self._needs_open()
         with self._store.transaction():
             self._prisms.confirm(session, operator)
             self._store.once_committed(partial(session.end_shots, self._clock.now()))
 
     def prism_suspicions(self) -> list[Suspicion]:
-        """Stations that may be on another prism than that of the open session; from any thread."""
+        """Return the stations that may be on a prism other than the open session's; may be called from any thread."""
         session = self._open
         return [] if session is None else self._prisms.suspicions(session)
 
     def prisms_fault(self) -> str | None:
-        """Return why joints do not tell whether a station is on its prism, a clause; None where they do."""
+        """Return why stations' prisms cannot be checked against the joints, a clause; None if they can."""
         return self._prisms.trouble()
 
     def not_counting(self, fresh_s: float) -> str | None:
-        """Return why the newest fix of the open session does not count; from any thread.
+        """Return why the newest fix of the open session is not used; may be called from any thread.
 
         Args:
-            fresh_s: how old it may be, real seconds; of an older one nothing is said.
+            fresh_s: largest age of the fix, real seconds; for an older fix None is returned.
         """
         opened, newest = self._open, self._observing.newest
         if opened is None or newest is None or newest[0] != opened.id:
@@ -336,7 +338,7 @@ class SessionManager:
     # ---- parts -------------------------------------------------------------------------------------------------------
 
     def _new_session(self, prism: str, kind: str, arguments: Mapping[str, Any], *, is_aimed: bool) -> OpenSession:
-        """Store a session in the set-up that is the current one now, or that is named; it is open once committed."""
+        """Store a session in the named or the current set-up; it is open once the transaction is committed."""
         setup_id, now = self._setups.usable(arguments.get("setup")), self._clock.now()
         session_id = identifier(arguments, "id", "a session's id", default=self._table.free_id(prism))
         if session_id in self._table.ids():
@@ -364,16 +366,16 @@ class SessionManager:
         self._open = session
 
     def _keep_shot(self, session: OpenSession, name: str, shot: Shot, most_off_mm: float) -> dict[str, Any]:
-        """Store a shot before it is over, and what it tells of fixes that came before anything told where its point is.
+        """Store a shot before it ends, and exclude earlier fixes near its point if this shot is the first to locate it.
 
-        Fixes that come late are of the point, and known to be.
+        Fixes of the point that arrive later are recognised by its place.
         """
         with self._store.transaction():
             phase = self._table.phase(session.id, name)
             result = self._setups.store_shot(
                 session.setup_id, session.id, name, phase, shot.fixes, shot.places_mm, most_off_mm=most_off_mm
             )
-            if result["misclosure_mm"] is None:  # nothing told before
+            if result["misclosure_mm"] is None:  # the place was unknown before
                 self._observations.exclude_near(session.id, [result[axis] for axis in AXES], CONTROL_POINT_RADIUS_MM)
             points = self._setups.control_points(session.setup_id)
             constants_mm = first_constants_mm(self._store, session.id)
@@ -381,7 +383,7 @@ class SessionManager:
         return result
 
     def _note_turned(self, session: OpenSession, at: Stamp) -> None:
-        """Note that the station was turned to the prism, where something can: it was, also if that cannot be stored."""
+        """Note that a program turned the station to the prism, if one does; if this cannot be stored, log it."""
         if self._aim is None:
             return
         try:
@@ -389,10 +391,10 @@ class SessionManager:
         except sqlite3.Error as error:
             if not is_unwritable(error):
                 raise
-            log.warning("it cannot be stored that the station was turned to prism %s: %s", session.prism, error)
+            log.warning("the turn of the station to prism %s could not be stored: %s", session.prism, error)
 
     def _close(self, state: str) -> OpenSession:
-        """End the open session, in the store and then here; what the store refuses leaves it open in both."""
+        """End the open session, in the store and then in memory; if the store refuses, it stays open in both."""
         session = self._needs_open()
         with self._store.transaction():
             until = self._lifecycle.end(session.id, state)
@@ -410,7 +412,7 @@ class SessionManager:
         return self._open
 
     def _go_on(self) -> None:
-        """Ready the sessions that an earlier run left to take fixes: of those that ended, what it did not decode."""
+        """Resume the sessions of an earlier run: the open one, and ended ones whose captures were not all decoded."""
         self._open, self._ended = self._lifecycle.unfinished(self._rig_text)
         self._lifecycle.judge_readings()
         for session in self._taking():
@@ -420,7 +422,7 @@ class SessionManager:
         opened = self._open
         if opened is None:
             return
-        log.warning("session %s (prism %s) was open when rigcal last ended; it goes on", opened.id, opened.prism)
-        if self._aim is not None:  # what aims may have forgotten; an operator's station has kept its lock
+        log.warning("session %s (prism %s) was open when rigcal last ended; it continues", opened.id, opened.prism)
+        if self._aim is not None:  # the aiming program may have lost its state; an operator's station has kept its lock
             self._aim(opened.prism)
             self._prisms.turned(opened, self._clock.now())

@@ -1,7 +1,7 @@
-"""Observations of calibration sessions: joined fixes, judged whether calibration may use them, and stored.
+"""Observations of calibration sessions: joined fixes, stored with the decision whether calibration may use them.
 
-A fix of the open session is kept whatever is wrong with it; why calibration must not use it stands beside it, and may
-change as more fixes come.
+Every fix of the open session is kept. The reason why calibration must not use it, if any, is stored with it, and may
+change as more fixes arrive.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ from drivers.readings import DeviceEvent, Fix
 log = logging.getLogger(__name__)
 
 STANDING_KINDS = ("static_poses", CHECK)
-_LEFT_OUT = "what a session observed cannot be stored, and is left out"
+_LEFT_OUT = "an observation of a session can never be stored, and was discarded"
 
 
 class PendingWrites:
-    """Changes that the store has yet to take, in their order; they wait while it refuses them for now.
+    """Pending changes of the store, in order; they wait while the store cannot be written.
 
     Args:
         store: the database.
@@ -43,7 +43,7 @@ class PendingWrites:
         self._is_waiting = False
 
     def add(self, write: Callable[[], object]) -> None:
-        """Add a change, made within the transaction of all that wait."""
+        """Add a change; all pending changes are made in one transaction."""
         self._writes.append(write)
 
     def add_event(self, event: DeviceEvent) -> None:
@@ -51,10 +51,10 @@ class PendingWrites:
         self.add(lambda: self._store.insert_records([event]))
 
     def store(self) -> None:
-        """Make all changes, or none while the store can take none; one that can never be made is told and left out.
+        """Make all changes, or none while the store cannot be written; log and discard a change that can never be made.
 
         Raises:
-            sqlite3.DatabaseError: the store is damaged and can commit none; they are given up.
+            sqlite3.DatabaseError: the store is damaged and cannot commit; all changes are discarded.
         """
         if not self._writes:
             return
@@ -63,17 +63,17 @@ class PendingWrites:
                 self._make(self._writes)
         except sqlite3.DatabaseError as error:
             if not is_unwritable(error):
-                self._writes.clear()  # what can never be stored must not keep out all that follows
+                self._writes.clear()  # changes that can never be stored must not block later ones
                 raise
             if not self._is_waiting:
-                log.error("observations cannot be stored (%s); they wait and are tried again", error)
+                log.error("observations cannot be stored (%s); they are kept in memory, and storing is retried", error)
             self._is_waiting = True
             return
         self._writes.clear()
         self._is_waiting = False
 
     def _make(self, writes: Sequence[Callable[[], object]]) -> None:
-        """Make changes; one that can never be made must not keep out the others."""
+        """Make changes; a change that can never be made does not block the others."""
         try:
             with self._store.transaction():
                 for write in writes:
@@ -82,7 +82,7 @@ class PendingWrites:
             if is_unwritable(error):
                 raise
             if len(writes) == 1:
-                # Once it is: where the disk then refuses the others, this one is tried again with them.
+                # Log only once committed: if the disk then refuses the others, this change is retried with them.
                 self._store.once_committed(partial(log.error, _LEFT_OUT, exc_info=error))
                 return
         else:
@@ -92,17 +92,17 @@ class PendingWrites:
 
 
 class ObservationMaker:
-    """Makes observations of joined fixes; for the writer's thread.
+    """Makes observations of joined fixes; for the writer thread.
 
     Args:
-        rig: whose joints they hold.
-        store: where they go.
-        pending: takes them, until the store does.
-        prisms: tell which fixes are of another prism.
-        run_id: of this run of the daemon; poses are numbered within it.
+        rig: the machine.
+        store: the database.
+        pending: queue of changes to the store.
+        prisms: decides which fixes are of another prism.
+        run_id: number of this run of the daemon; poses are numbered within a run.
 
     Attributes:
-        newest: session and instant of the newest observation, and why it does not count; None before the first.
+        newest: session and instant of the newest observation, and why it is not used; None before the first.
     """
 
     def __init__(self, rig: Rig, store: Store, pending: PendingWrites, prisms: PrismWatch, run_id: int) -> None:
@@ -115,9 +115,9 @@ class ObservationMaker:
         """Make an observation of the session in which a fix was measured.
 
         Args:
-            session: it was open then.
+            session: the session.
             joined: the fix with its joints.
-            place_mm: where the fix lies.
+            place_mm: place of the fix in the station's frame.
         """
         excluded = (
             self._why_not_a_pose(session, joined, place_mm)
@@ -128,19 +128,19 @@ class ObservationMaker:
         self._pending.add(lambda: self._add(session, joined, place_mm, excluded))
 
     def _why_not_a_pose(self, session: OpenSession, joined: JoinedFix, place_mm: Place) -> str | None:
-        """Why a fix is no pose of the machine, whichever prism it is of; fixes that may be are followed."""
+        """Return why a fix cannot be used as a pose, whatever its prism; None if it can. Usable fixes are followed."""
         if joined.refused:
             return joined.refused
         for joint in self._rig.joint_names:
             if joint in session.jumped and lies_within(session.order, joined.stamp, session.jumped[joint], None):
-                return f"{joint} jumped: its readings from then on do not fit those before"
+                return f"{joint} jumped: its readings after the jump do not fit those before"
         if session.is_control_point(place_mm):
             return OF_CONTROL_POINT
         self._prisms.follow(session, joined, place_mm)
         return "moving" if session.kind in STANDING_KINDS and joined.standstill is None else None
 
     def _why_another_prism(self, session: OpenSession, joined: JoinedFix, place_mm: Place) -> str | None:
-        """Why a fix must not be used since it may be of another prism; earlier ones are judged again."""
+        """Return why a fix may be of another prism, and judge earlier fixes again; None if it is not suspected."""
         changed = self._prisms.ask_joints(session, joined, place_mm)
         if changed:
             changed |= self._places.withdraw([at_ns for at_ns, why in changed.items() if why is not None])
@@ -159,7 +159,7 @@ class ObservationMaker:
             self._pending.add(lambda: self._table.exclude(session.id, changed, stamp))
 
     def _add(self, session: OpenSession, joined: JoinedFix, place_mm: Place, excluded: str | None) -> None:
-        """Store an observation; since it was judged, a shot may have told that a control point is there."""
+        """Store an observation; a shot may have located a control point at its place since it was judged."""
         if excluded is None and session.is_control_point(place_mm):
             excluded = OF_CONTROL_POINT
         standing = joined.standstill is not None
@@ -179,10 +179,10 @@ class ObservationMaker:
 
 
 def _why_another_constant(session: OpenSession, fix: Fix) -> str | None:
-    """Why a fix that might be used must not be: its station applies another prism constant than to the first one."""
+    """Return a clause if a fix's prism constant differs from that of the session's first usable fix, otherwise None."""
     if fix.prism_constant_mm is None:
         return None
     first_mm = session.constants_mm.setdefault(fix.station, fix.prism_constant_mm)
     if abs(fix.prism_constant_mm - first_mm) <= CONSTANT_TOLERANCE_MM:
         return None
-    return f"the station applies a prism constant of {fix.prism_constant_mm:g} mm, and {first_mm:g} mm at first"
+    return f"the station applies a prism constant of {fix.prism_constant_mm:g} mm, but applied {first_mm:g} mm at first"

@@ -1,4 +1,4 @@
-"""Watches in each session that its stations stay on its prism, and takes an operator's word that they are."""
+"""Checks in each session that its stations stay on its prism, and takes an operator's confirmation that they do."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from daemon.acquisition.joiner import JoinedFix
 from daemon.commands import caller_columns
 from daemon.sessions.open_session import OpenSession
 from daemon.sessions.prisms.evidence import Finding, IdentityLoader, PrismEvidence, Stretch, Verdict, sightings_of
-from daemon.sessions.prisms.guard import CONFIRM, MotionLimit, PrismGuard, Suspicion, Turn, Word
+from daemon.sessions.prisms.guard import UNTIL, MotionLimit, OperatorConfirmation, PrismGuard, Suspicion, Turn
 from daemon.sessions.prisms.standstill_places import Exclusions
 from daemon.sessions.station_setups import Place
 from daemon.store.queries.observations import fixes_since_used
@@ -33,11 +33,11 @@ class PrismWatch:
     """The guards of sessions' prisms.
 
     Args:
-        store: where operators' words are kept; fixes and observations are there.
-        rig: whose sessions are watched.
-        clock: for when they were given.
-        limits: station -> what motion can do to its prism.
-        tell: takes what there is to tell an operator, to be stored.
+        store: store of the operators' confirmations, the fixes and the observations.
+        rig: rig whose sessions are checked.
+        clock: clock for the instants of confirmations and events.
+        limits: station -> limits of its prism's motion.
+        tell: called with each event for the operator, to store it.
     """
 
     def __init__(
@@ -53,15 +53,15 @@ class PrismWatch:
         self._loader = IdentityLoader(rig)
 
     def prepare(self, wait_s: float = 0.0) -> None:
-        """Be ready to ask the joints of a session's prism, and wait for that at most so long."""
+        """Start loading the check against the joints, and wait for its end for at most `wait_s` seconds."""
         self._loader.start(wait_s)
 
     def trouble(self) -> str | None:
-        """Return why the joints cannot be asked of prisms, a clause; None where they can, or nobody has wanted to."""
+        """Return why prisms cannot be checked against the joints, a clause; None if they can, or have not been yet."""
         return self._loader.trouble
 
     def begin(self, session: OpenSession) -> None:
-        """Take a session's set-up into account: what was measured there before."""
+        """Load what earlier sessions measured in the session's set-up."""
         jumps = [jump for jump in preset_jumps(self._store, None) if jump.device in self._rig.joint_names]
         groups: dict[str, list[tuple[str, Mapping[str, float], Place]]] = {}
         for row in self._table.standstill_observations(session.setup_id, jumps[-1].at if jumps else None):
@@ -71,13 +71,19 @@ class PrismWatch:
         session.evidence = PrismEvidence(self._rig, session.prism, self._loader, earlier)
 
     def see(self, session: OpenSession, fix: Fix) -> None:
-        """Take a fix of the session, in order."""
+        """Add a fix of the session, in order."""
         event = self._take(session, fix)
         if event is not None:
             self._tell(event)
 
     def ask_joints(self, session: OpenSession, joined: JoinedFix, place_mm: Place) -> Exclusions:
-        """Ask the joints of a fix that was seen; why earlier observations must not be used, where that has changed."""
+        """Compare a fix given to `see` with the joints, and return the exclusions of earlier observations that change.
+
+        Args:
+            session: session in which the fix was measured.
+            joined: the fix with its joints.
+            place_mm: place of its target in the station's frame.
+        """
         guard, evidence = session.guards.get(joined.fix.station), session.evidence
         turn = None if guard is None else guard.turn(joined.fix.stamp)
         if guard is None or evidence is None or turn is None:
@@ -91,10 +97,16 @@ class PrismWatch:
         return changed
 
     def follow(self, session: OpenSession, joined: JoinedFix, place_mm: Place) -> None:
-        """Hold a fix that was seen, whether it is used or not, against what the joints did since the one before.
+        """Compare a fix given to `see`, used or not, with the motion of the joints since the previous fix.
 
-        A target that has moved otherwise is another one, although it is no further than a prism might move. Which of
-        both is meant is left to what the joints say of the whole stretch, or to an operator: its fixes do not count.
+        A target that has moved differently is another target, even if a prism could have moved as far. Which of the two
+        is the session's prism is decided by the joints over the whole stretch, or by an operator; until then the fixes
+        are not used.
+
+        Args:
+            session: session in which the fix was measured.
+            joined: the fix with its joints.
+            place_mm: place of its target in the station's frame.
         """
         guard, evidence = session.guards.get(joined.fix.station), session.evidence
         turn = None if guard is None else guard.turn(joined.fix.stamp)
@@ -114,10 +126,10 @@ class PrismWatch:
         self._tell_of_jump(joined.fix.station, text)
 
     def _stray(self, session: OpenSession, joined: JoinedFix, turn: Turn, stretch: Stretch) -> Exclusions:
-        """Suspect all since a turn where the target strayed from what the joints did; the turn's observations.
+        """Suspect all fixes since a turn if the target strayed from the joints' motion; return their exclusions.
 
-        What strays little by little jumps nowhere: it was another target from the turn on, also where an operator had
-        confirmed the prism: the lock may have been lost just after.
+        A target that strays gradually shows no jump. It was another target from the turn on, even where an operator had
+        confirmed the prism, because the lock may have been lost just afterwards.
         """
         guard, station = session.guards[joined.fix.station], joined.fix.station
         if guard.doubt(joined.fix.stamp) is not None or session.evidence is None:
@@ -131,26 +143,26 @@ class PrismWatch:
         return dict.fromkeys(stretch.instants_ns, suspicion.reason)
 
     def _heed(self, session: OpenSession, finding: Finding) -> Exclusions:
-        """Suspect a stretch, or suspect it no more, as the joints say; its observations for which that is news."""
+        """Suspect or clear a stretch by the verdict of the joints, and return the exclusions that change."""
         stretch, station = finding.stretch, finding.stretch.station
         guard = session.guards[station]
         turn, is_suspected = Turn(stretch.since, stretch.is_believed), guard.doubt(stretch.since) is not None
         if is_suspected == (stretch.verdict is Verdict.OTHER):
             return {}
         if stretch.verdict is Verdict.OTHER:
-            fits = f"; it fits {finding.is_like}" if finding.is_like else ""
-            evidence = f"{finding.distance_m:.2f} m from where the joints put {session.prism}{fits}"
+            fits = f", and fits {finding.is_like}" if finding.is_like else ""
+            evidence = f"the target is {finding.distance_m:.2f} m from where the joints place {session.prism}{fits}"
             reason: str | None = guard.suspect(turn, finding.distance_m, evidence).reason
-            self._tell_of_jump(station, f"the target is {evidence}")
+            self._tell_of_jump(station, evidence)
         else:
             guard.clear(turn)
             reason = None
-            text = f"the target is where the joints put {session.prism}; its fixes count"
+            text = f"the target is where the joints place {session.prism}; its fixes are used"
             self._tell(DeviceEvent(station, self._clock.now(), EventKind.LOCK_ACQUIRED, text))
         return dict.fromkeys(stretch.instants_ns, reason)
 
     def _tell_of_jump(self, station: str, what: str) -> None:
-        text = f"{what}; its fixes do not count until the station is back, or until {CONFIRM}"
+        text = f"{what}; its fixes are not used {UNTIL}"
         self._tell(DeviceEvent(station, self._clock.now(), EventKind.PRISM_JUMP, text))
 
     def _tell(self, event: DeviceEvent) -> None:
@@ -158,31 +170,31 @@ class PrismWatch:
         self._keep(event)
 
     def doubt(self, session: OpenSession, fix: Fix) -> str | None:
-        """Why a fix that was seen must not be used; None when it may."""
+        """Return why a fix given to `see` must not be used; None if it may."""
         guard = session.guards.get(fix.station)
         suspicion = guard.doubt(fix.stamp) if guard is not None else None
         return suspicion.reason if suspicion is not None else None
 
     def suspicions(self, session: OpenSession) -> list[Suspicion]:
-        """Return the suspicions of the session that last."""
+        """Return the session's lasting suspicions."""
         return [guard.suspicion for guard in list(session.guards.values()) if guard.suspicion is not None]
 
     def confirm(self, session: OpenSession, operator: str) -> dict[str, Any]:
-        """Take the word that the session's stations are on its prism: their fixes count from now on."""
+        """Note the confirmation that the session's stations are on its prism: their fixes are used from now on."""
         ended = self.suspicions(session)
         at = self._clock.now()
         who = operator or "an operator"
-        text = f"{who} confirms that the station is on prism {session.prism}; its fixes count from now on"
+        text = f"{who} confirms that the station is on prism {session.prism}; its fixes are used from now on"
         stations = [suspicion.station for suspicion in ended] or [*self._limits]
         events = [DeviceEvent(station, at, EventKind.PRISM_CONFIRMED, text) for station in stations]
         with self._store.transaction():
             self._table.add_confirmation(session.id, at, operator=operator, turning=False, **caller_columns())
             self._store.insert_records(events)
-            self._store.once_committed(partial(session.words.append, Word(at)))
+            self._store.once_committed(partial(session.confirmations.append, OperatorConfirmation(at)))
         log.info("session %s: %s", session.id, text)
         advice = [
-            f"what {suspicion.station} measured before it jumped by {suspicion.distance_m:.2f} m counts too: if it was "
-            "on another prism then, abort the session and hold a new one"
+            f"fixes that {suspicion.station} measured before its target jumped by {suspicion.distance_m:.2f} m are "
+            "also used: if it was on another prism then, abort the session and hold a new one"
             for suspicion in ended
         ]
         return {
@@ -194,20 +206,20 @@ class PrismWatch:
         }
 
     def turned(self, session: OpenSession, at: Stamp) -> None:
-        """The station was turned to the session's prism by something that knows where that is."""
+        """Note that the station was turned to the session's prism by a program that knows the prism's place."""
         self._table.add_confirmation(session.id, at, turning=True)
-        self._store.once_committed(partial(session.words.append, Word(at, is_turning=True)))
+        self._store.once_committed(partial(session.confirmations.append, OperatorConfirmation(at, is_turning=True)))
 
     def restore(self, session: OpenSession) -> None:
-        """Restore the knowledge of an earlier run of the daemon from the store; the next fix is a new lock.
+        """Restore the state of an earlier run of the daemon from the store; the next fix is treated as a new lock.
 
-        A restart ends no suspicion, and what happened while nobody listened may begin one.
+        A restart ends no suspicion, and a change of target while the daemon was down may begin one.
         """
         self.prepare()
         self.begin(session)
         with self._store.reader() as reader:
-            words = prism_confirmations(reader, session.id)
-            session.words += [Word(reader.stamp(row), bool(row["turning"])) for row in words]
+            rows = prism_confirmations(reader, session.id)
+            session.confirmations += [OperatorConfirmation(reader.stamp(row), bool(row["turning"])) for row in rows]
             for station in self._limits:
                 for row in fixes_since_used(reader, session.id, station):
                     self._take(session, _fix(station, row, reader.stamp(row)))
@@ -226,12 +238,12 @@ class PrismWatch:
     def _guard(self, session: OpenSession, station: str) -> PrismGuard:
         if station not in session.guards:
             limit = self._limits.get(station, MotionLimit())
-            session.guards[station] = PrismGuard(station, limit, session.words, self._store.order)
+            session.guards[station] = PrismGuard(station, limit, session.confirmations, self._store.order)
         return session.guards[station]
 
 
 def as_dict(suspicion: Suspicion) -> dict[str, Any]:
-    """A suspicion as `status` shows it."""
+    """Return a suspicion as `status` shows it."""
     return {
         "station": suspicion.station,
         "since_utc_ns": suspicion.since.utc_ns,
@@ -242,10 +254,10 @@ def as_dict(suspicion: Suspicion) -> dict[str, Any]:
 
 
 def _fix(station: str, row: Mapping[str, Any], stamp: Stamp) -> Fix:
-    """As much of a stored fix as a guard looks at."""
+    """Return a stored fix with the fields that a guard uses."""
     numbers = {name: row[name] for name in _NUMBERS}
     return Fix(station, stamp, stamp, Status(row["status"]), LockState(row["lock"]), **numbers)
 
 
 def _moved_otherwise(distance_m: float, prism: str) -> str:
-    return f"the target moved {distance_m:.2f} m otherwise than the joints moved {prism}"
+    return f"the target's motion differs by {distance_m:.2f} m from the motion of {prism} computed from the joints"

@@ -1,4 +1,4 @@
-"""Captured files back into captures: one time axis, link names of the configuration; and stored readings as text."""
+"""Captures read back from captured files, on one time axis and with the configured link names; readings as text."""
 
 from __future__ import annotations
 
@@ -30,23 +30,25 @@ LATEST_UTC_NS = 4_102_444_800 * NS_PER_S  # the year 2100
 
 
 def captures_of(path: Path, config: Config, told: SessionFile | None = None) -> Iterator[Capture]:
-    """Captures of one file, in order, with the link names of the configuration.
+    """Yield the captures of one file, in order, with the link names of the configuration.
 
-    A CAN log's channels are matched with the configured links' names, then with their channels (`can0`); the numbers
-    of `.asc` and `.blf` by the session file, else as `vector_channels` has it. A log of one channel and a configuration
-    of one link belong together in any case, unless the session file says otherwise. Two channels never become one link.
+    The channels of a CAN log are matched with the names of the configured links, then with their channels (`can0`).
+    Channel numbers of `.asc` and `.blf` are matched by the session file, or else as in `vector_channels`. If the log
+    has one channel and one link is configured, they are matched in any case, unless the session file contradicts. Two
+    channels never become one link.
 
-    A log knows UTC alone, so all stamps are put on one monotonic axis: that of UTC. Recorded time that steps back
-    stands still until it is past again.
+    A log contains UTC only, so all stamps use UTC as their monotonic axis. Where recorded time steps back, monotonic
+    time stands still until recorded time has caught up.
 
     Args:
         path: the file.
-        config: names the links.
+        config: the configuration, which names the links.
         told: the session file of the log; None without one.
 
     Raises:
-        DescriptionError: the file is malformed (file and line), is no captured log, or has several channels for a link,
-            or one that may be several links'; or it is not the one that the session file speaks of.
+        DescriptionError: the file is malformed (the message gives file and line), is not a captured log, has several
+            channels for one link or a channel that fits several links, or is not the file that the session file
+            describes.
         ConfigError: a link of the file is not configured.
     """
     captures: Iterator[Capture]
@@ -78,16 +80,17 @@ def captures_of(path: Path, config: Config, told: SessionFile | None = None) -> 
         if channels.setdefault(link, capture.link) != capture.link:
             raise _several_channels(path, link, what, known)
         if not 0 <= capture.stamp.utc_ns < LATEST_UTC_NS:
-            raise DescriptionError(str(path), f"a capture at {capture.stamp.utc_ns / NS_PER_S:.0f} s is beyond 2100")
+            at_s = capture.stamp.utc_ns / NS_PER_S
+            raise DescriptionError(str(path), f"the time of a capture, {at_s:.0f} s, is not between 1970 and 2100")
         latest_ns = max(latest_ns, capture.stamp.utc_ns)
         is_doubtful = link in doubtful and doubtful[link].is_among(counts[link])
         counts[link] += 1
         yield replace(capture, link=link, stamp=Stamp(capture.stamp.utc_ns, latest_ns, BOOT_ID, is_doubtful))
     for link, count in counts.items():
         if link in doubtful and doubtful[link].captures != count:
-            expected = f"the session file is of one with {doubtful[link].captures}"
+            expected = f"but the session file expects {doubtful[link].captures}"
             raise DescriptionError(
-                str(path), f"has {count} captures of link {link!r}, {expected}: give the log that was exported with it"
+                str(path), f"has {count} captures of link {link!r}, {expected}: give the log exported with that file"
             )
 
 
@@ -95,25 +98,31 @@ def _several_channels(path: Path, link: str, what: str, known: Mapping[str, str]
     found = ", ".join(sorted({capture.link for capture in read_can_log(path)}))
     return DescriptionError(
         str(path),
-        f"holds frames of several channels, {found}, of which more than one would become link {link!r}: configure each "
-        f"as a {what} (known: {', '.join(known)}), or give a log of the link's channel alone",
+        f"contains frames of several channels, {found}, and more than one would become link {link!r}: configure each "
+        f"as a {what} (known: {', '.join(known)}), or give a log of only the link's channel",
     )
 
 
 def first_captures(paths: Sequence[Path], config: Config, told: SessionFile | None = None) -> dict[Path, Capture]:
-    """The first capture of each file; every file is read through, so that a bad one is refused before anything runs.
+    """Return the first capture of each file; every file is read completely, so that faults are found before the replay.
 
-    A file without captures has none, and is taken where it is named by a link that had none by the session file.
+    A file without captures is accepted, and left out of the result, if its name is that of a link of which the session
+    file knows no capture.
+
+    Args:
+        paths: the files.
+        config: the configuration, which names the links.
+        told: the session file of the logs; None without one.
 
     Raises:
-        DescriptionError, ConfigError: as `captures_of`; or a file holds no captures, is given twice, or has captures of
-            a link from a time from which another file has them; or a link has none from the time of the session.
+        DescriptionError, ConfigError: as for `captures_of`; or a file contains no captures, is given twice, or overlaps
+            in time with another file of the same link; or a link has no captures from the time of the session.
     """
     firsts: dict[Path, Capture] = {}
     spans: dict[str, list[_Span]] = {}
     for path in paths:
         if path in firsts:
-            raise DescriptionError(str(path), "is given twice: its captures would be stored twice; give it once")
+            raise DescriptionError(str(path), "is given twice, so its captures would be stored twice; give it once")
         found: dict[str, _Span] = {}
         for capture in captures_of(path, config, told):
             firsts.setdefault(path, capture)
@@ -121,14 +130,14 @@ def first_captures(paths: Sequence[Path], config: Config, told: SessionFile | No
             span = found.get(capture.link)
             found[capture.link] = _Span(path, at_ns, at_ns) if span is None else span._replace(last_ns=at_ns)
         if path not in firsts and not _is_of_silent_link(path, config, told):
-            raise DescriptionError(str(path), "holds no captures: leave it out")
+            raise DescriptionError(str(path), "contains no captures: leave it out")
         for link, span in found.items():
             others = spans.setdefault(link, [])
             for other in others:
                 span.check_apart(other, link)
             others.append(span)
     if not firsts:
-        raise DescriptionError(", ".join(map(str, paths)), "no file holds captures: nothing can be replayed")
+        raise DescriptionError(", ".join(map(str, paths)), "no file contains captures: nothing can be replayed")
     if told is not None:
         for link, found_in in spans.items():
             _check_overlap(found_in, link, told)
@@ -136,7 +145,7 @@ def first_captures(paths: Sequence[Path], config: Config, told: SessionFile | No
 
 
 def _is_of_silent_link(path: Path, config: Config, told: SessionFile | None) -> bool:
-    """Return True for the log of a link that a session file knows, and of which it knows no capture."""
+    """Return True if a file is named after a link of the session file which has no doubtful captures there."""
     if told is None:
         return False
     stations = (section.name for section in config.station)
@@ -145,28 +154,28 @@ def _is_of_silent_link(path: Path, config: Config, told: SessionFile | None) -> 
 
 
 class _Span(NamedTuple):
-    """From when to when a file has captures of a link."""
+    """Time of the first and the last capture of a link in a file."""
 
     path: Path
     first_ns: int
     last_ns: int
 
     def check_apart(self, other: _Span, link: str) -> None:
-        """Refuse a file that has captures of the link from the time of another; they may meet at one instant."""
+        """Refuse a file that overlaps in time with another file of the link; they may share one instant."""
         first_ns, last_ns = max(self.first_ns, other.first_ns), min(self.last_ns, other.last_ns)
         if first_ns < last_ns or (self.first_ns, self.last_ns) == (other.first_ns, other.last_ns):
             raise DescriptionError(
                 str(self.path),
-                f"holds captures of link {link!r} from {_utc(first_ns)} to {_utc(last_ns)}, and so does {other.path}: "
-                "they would be stored twice; give one of the two",
+                f"contains captures of link {link!r} from {_utc(first_ns)} to {_utc(last_ns)}, and so does "
+                f"{other.path}: they would be stored twice; give one of the two",
             )
 
     def is_of(self, told: SessionFile) -> bool:
-        """Return True if some of it may be from the time of a session."""
+        """Return True if part of the span may lie in a session."""
         return self.first_ns <= told.until_utc_ns + AFTER_NS and self.last_ns >= told.since_utc_ns - BEFORE_NS
 
     def zone_of_second_hour(self, told: SessionFile) -> str | None:
-        """Return a TZ of fixed offset in which a log of a local time that comes twice is the session's; else None."""
+        """Return a TZ of fixed offset in which an ambiguous local time matches the session; None if there is none."""
         second = datetime.fromtimestamp(self.first_ns / NS_PER_S, UTC).astimezone().replace(tzinfo=None, fold=1)
         later_ns = round(second.timestamp() * NS_PER_S) - self.first_ns
         moved = self._replace(first_ns=self.first_ns + later_ns, last_ns=self.last_ns + later_ns)
@@ -179,27 +188,27 @@ class _Span(NamedTuple):
 
 
 def _check_overlap(spans: Sequence[_Span], link: str, told: SessionFile) -> None:
-    """Refuse a link whose files have nothing from the time of their session: the clock of one of them is another."""
+    """Refuse a link whose files have no captures from the time of the session: their clocks differ."""
     if any(span.is_of(told) for span in spans):
         return
     path, first_ns, last_ns = spans[0]
     zone = spans[0].zone_of_second_hour(told) if path.suffix.lower() == ".asc" else None
     if zone is not None:
         remedy = (
-            "the local time of an .asc may come twice at the end of summer time, and the first one was read: set the "
-            f"environment variable TZ to {zone}, in which the log is of the session's time, or export the session with "
+            "local time in an .asc is ambiguous at the end of summer time, and was read as the earlier one: set the "
+            f"environment variable TZ to {zone}, with which the log matches the session, or export the session with "
             "--format candump"
         )
     elif path.suffix.lower() == ".asc":
         remedy = (
-            "an .asc holds local time without its zone: set the environment variable TZ to the zone where it was made, "
-            "as TZ=Europe/Berlin, or export the session with --format candump"
+            "an .asc contains local time without a time zone: set the environment variable TZ to the zone where it was "
+            "made, such as TZ=Europe/Berlin, or export the session with --format candump"
         )
     else:
-        remedy = "give the files that were exported with it"
+        remedy = "give the files that were exported with the session"
     raise DescriptionError(
         str(path),
-        f"holds captures of link {link!r} from {_utc(first_ns)} to {_utc(last_ns)}, and the session was from "
+        f"contains captures of link {link!r} from {_utc(first_ns)} to {_utc(last_ns)}, but the session lasted from "
         f"{_utc(told.since_utc_ns)} to {_utc(told.until_utc_ns)}: {remedy}",
     )
 
@@ -209,15 +218,15 @@ def _utc(utc_ns: int) -> str:
 
 
 def merged(paths: Sequence[Path], config: Config, told: SessionFile | None = None) -> Iterator[Capture]:
-    """Captures of several files in the order of their instants; at one instant in the order of the files."""
+    """Yield the captures of several files in order of time; at equal instants in the order of the files."""
     files = (captures_of(path, config, told) for path in paths)
     return heapq.merge(*files, key=lambda capture: capture.stamp.monotonic_ns)
 
 
 def stored_readings(reader: Reader) -> Iterator[str]:
-    """Yield what decoding has stored as JSON lines that depend on nothing but the captures.
+    """Yield all decoded records as JSON lines that depend only on the captures.
 
-    One line a joint sample, signal, fix, event, failure and gap, each kind in the order it was stored.
+    There is one line per joint sample, signal, fix, event, failure and gap, each kind in the order it was stored.
     """
     for table, row in reader.records():
         plain = {key: value.hex() if isinstance(value, bytes) else value for key, value in row.items()}

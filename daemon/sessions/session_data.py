@@ -1,6 +1,6 @@
-"""Contents of a stored session and the time of its rows, for calibration, report and export.
+"""Contents of stored sessions and the time of their rows, for calibration, reports and export.
 
-Observations come as CSV (docs/reference/formats.md): from here on a session is read exactly as an imported file is.
+Observations are given as CSV (docs/reference/formats.md), so that a session is read exactly as an imported file.
 """
 
 from __future__ import annotations
@@ -26,15 +26,21 @@ Misclosure = tuple[float, float, float]
 
 
 def sessions_csv(reader: Reader, rig: Rig, session_ids: Sequence[str], *, moving: bool = False) -> bytes:
-    """Observations of the given sessions that calibration may use, oldest first; with `moving` those of a moving boom.
+    """Return the observations of sessions that calibration may use, as CSV, oldest first.
 
     `time_s` counts from the store's first observation that calibration may use, on one axis for all sessions
-    (`daemon.store.queries.time_axis`). It is the same whichever sessions are asked for: what a model has learned from
-    some of them depends on time (a jump, a base that settles), and is applied to others.
+    (`daemon.store.queries.time_axis`). It does not depend on the sessions requested, because a model may learn effects
+    of time (a jump, a settling base) from some sessions and is applied to others.
+
+    Args:
+        reader: the store.
+        rig: the machine.
+        session_ids: the sessions.
+        moving: return the observations of a moving boom instead.
 
     Raises:
-        DataError: another rig file turned counts into the readings of one of the sessions, so that they are not
-            readings of `rig`.
+        DataError: the readings of one of the sessions were converted from counts with a different rig file, so that
+            they are not readings of `rig`.
     """
     for name in session_ids:
         row = session(reader, name)
@@ -60,12 +66,12 @@ def sessions_csv(reader: Reader, rig: Rig, session_ids: Sequence[str], *, moving
 
 @dataclass(frozen=True)
 class Measured:
-    """Who measured some sessions, when and with what.
+    """Operators, instruments and time of a set of sessions.
 
     Attributes:
-        sessions, operators, instruments, setups: names, each once; an operator is the name that was given, else the
-            user's.
-        measured_utc_ns: from the start of the first session to the end of the last; None without any.
+        sessions, operators, instruments, setups: names, each once; an operator is the name given, or else the user
+            name.
+        measured_utc_ns: start of the first session and end of the last; None without any.
     """
 
     sessions: tuple[str, ...]
@@ -76,7 +82,7 @@ class Measured:
 
 
 def sessions_measured(reader: Reader, session_ids: Sequence[str]) -> Measured:
-    """Return who measured the given sessions, when and with what."""
+    """Return operators, instruments and time of the given sessions."""
     rows = [row for name in session_ids if (row := session(reader, name)) is not None]
     instants = [row[key] for row in rows for key in ("started_utc_ns", "ended_utc_ns") if row[key] is not None]
     setups = setups_of(reader, session_ids)
@@ -90,9 +96,9 @@ def sessions_measured(reader: Reader, session_ids: Sequence[str]) -> Measured:
 
 
 def setup_lines(reader: Reader, session_ids: Sequence[str]) -> list[SetupLine]:
-    """The set-ups of the given sessions with the misclosures of their control points, for the report.
+    """Return the set-ups of the given sessions with the misclosures of their control points, for the report.
 
-    A point shot in several sessions is shown with the first session's start and the last session's end.
+    A point shot in several sessions is shown with its shot at the first session's start and at the last session's end.
     """
     lines = []
     for setup in setups_of(reader, session_ids):

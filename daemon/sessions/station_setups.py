@@ -1,4 +1,4 @@
-"""Station set-ups: where the total station stands, and the control points that tell whether it still does."""
+"""Station set-ups: where the total station stands, and the control points that show whether it has moved."""
 
 from __future__ import annotations
 
@@ -36,10 +36,10 @@ class StationSetups:
     """The set-ups of a store.
 
     Args:
-        rig: whose prisms have constants.
-        store: where set-ups are kept.
-        clock: time.
-        tolerance_mm: a control point further off than this says that the set-up moved.
+        rig: the machine, whose prisms have constants.
+        store: store of the set-ups.
+        clock: clock for the instants of set-ups.
+        tolerance_mm: a control point that is off by more than this shows that the set-up has moved.
     """
 
     def __init__(self, rig: Rig, store: Store, clock: Clock, tolerance_mm: float) -> None:
@@ -47,16 +47,16 @@ class StationSetups:
         self._table, self._sessions = SetupTable(store, rig.name), SessionTable(store, rig.name)
 
     def new_command(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
-        """A station set-up: instrument, tilt, ppm. It replaces none: sessions name theirs.
+        """Store a new station set-up: instrument, tilt, ppm. It replaces no other, because each session names its own.
 
         Raises:
-            CommandError: a session is open, which goes on with the set-up that it was started in.
+            CommandError: an argument is wrong, the name exists already, or a session is open, which keeps its set-up.
         """
         setup_id = identifier(arguments, "id", "a set-up's id")
         if setup_id in self._table.states():
             raise CommandError(
-                f"set-up {setup_id!r} exists already: `--setup {setup_id}` goes on in it where the station stands "
-                "as then; one that was moved is a new set-up, of another name"
+                f"set-up {setup_id!r} exists already: use `--setup {setup_id}` if the station has not moved since; if "
+                "it has, describe a new set-up with a different name"
             )
         constants = mapping_argument(arguments, "prism_constants_mm")
         for prism in constants:
@@ -68,7 +68,7 @@ class StationSetups:
             )
         given = mapping_argument(arguments, "control_points")
         if named := next((name for name in given if name in self._rig.prism_names), None):
-            raise CommandError(f"{named!r} is a prism of the rig; a control point stands still beside it")
+            raise CommandError(f"{named!r} is a prism of the rig; name a control point, which does not move with it")
         points = {str(n): _place(n, place) for n, place in given.items()}
         row: dict[str, object] = {
             "instrument": text_argument(arguments, "instrument"),
@@ -81,8 +81,7 @@ class StationSetups:
         with self._store.transaction():
             if (opened := self._sessions.open_session()) is not None:
                 raise CommandError(
-                    f"session {opened.id!r} is open where the station stood at its start; {HOW_TO_END}, and then "
-                    "describe where the station stands now",
+                    f"session {opened.id!r} is open in the present set-up; {HOW_TO_END}, then describe the new set-up",
                     REFUSED,
                 )
             self._table.add(self._clock.now(), id=setup_id, **row)
@@ -91,16 +90,19 @@ class StationSetups:
         return {"id": setup_id}
 
     def list_command(self, _arguments: Mapping[str, Any]) -> list[dict[str, Any]]:
-        """All set-ups with their control points, oldest first, and which is the current one."""
+        """Return all set-ups with their control points, oldest first, and mark the current one."""
         current = self._table.current()
         name = None if current is None else current.id
         return [setup | {"is_current": setup["id"] == name} for setup in self._table.all()]
 
     def usable(self, wanted: object) -> str:
-        """The set-up that is asked for, or the current one: where the station stood before that one it stands no more.
+        """Return the requested set-up, or the current one if none is requested.
+
+        Args:
+            wanted: name of the set-up; None for the current one.
 
         Raises:
-            CommandError: there is none, or it has moved.
+            CommandError: there is no such set-up, or it has moved.
         """
         if wanted is None:
             current = self._table.current()
@@ -108,8 +110,8 @@ class StationSetups:
                 raise CommandError("there is no station set-up; describe one with `rigcal setup new`")
             if current.state != "ok":
                 raise CommandError(
-                    f"set-up {current.id!r}, where the station stood last, has {current.state}; describe a new one "
-                    "(`rigcal setup new`), or name one with --setup if the station stands there again",
+                    f"the current set-up {current.id!r} has {current.state}; describe a new one with "
+                    "`rigcal setup new`, or name an earlier one with --setup if the station stands there again",
                     REFUSED,
                 )
             return current.id
@@ -118,18 +120,18 @@ class StationSetups:
             raise CommandError(f"there is no set-up {wanted!r:.80}; known: {', '.join(states) or 'none'}")
         if states[wanted] != "ok":
             raise CommandError(
-                f"set-up {wanted!r} has {states[wanted]}: its control points no longer fit; describe where the "
-                "station stands now with `rigcal setup new`",
+                f"set-up {wanted!r} has {states[wanted]}: its control points no longer fit; describe the station's "
+                "new set-up with `rigcal setup new`",
                 REFUSED,
             )
         return wanted
 
     def has_moved(self, setup_id: str) -> bool:
-        """Return True if a control point of the set-up was not where it had been."""
+        """Return True if a control point has shown that the set-up has moved."""
         return self._table.states()[setup_id] != "ok"
 
     def current(self) -> str | None:
-        """The set-up that the station stands in; None where there is none, and where it has moved."""
+        """Return the set-up that the station stands in; None if there is none, or if it has moved."""
         current = self._table.current()
         return current.id if current is not None and current.state == "ok" else None
 
@@ -144,22 +146,22 @@ class StationSetups:
         *,
         most_off_mm: float = math.inf,
     ) -> dict[str, Any]:
-        """Write down that a control point was shot, and whether it still is where it was.
+        """Store a shot of a control point, and mark the set-up as moved if the point is not where it was.
 
         Args:
             setup_id: set-up of the station.
-            session_id: session in which it was shot.
-            name: of the point; its first shot defines its place.
+            session_id: session in which the point was shot.
+            name: name of the point; its first shot defines its place.
             phase: `start` or `end` of the session.
             fixes: fixes that are averaged.
             places_mm: their places in the station's frame.
-            most_off_mm: what lies further from the point's known place is taken for something else.
+            most_off_mm: a target further from the point's known place is not the point.
 
         Returns:
             point, phase, x_mm, y_mm, z_mm, misclosure_mm (None if this shot defined the point), moved.
 
         Raises:
-            CommandError: the station is on something else; nothing is stored.
+            CommandError: the station is not on the point; nothing is stored.
         """
         known = self._known_place(setup_id, session_id, name, phase)
         place = {axis: fmean(p[i] for p in places_mm) for i, axis in enumerate(AXES)}
@@ -167,9 +169,9 @@ class StationSetups:
         distance_mm = math.dist([*place.values()], [reference[axis] for axis in AXES])
         if distance_mm > most_off_mm:
             raise CommandError(
-                f"the station is on something that is {distance_mm / 1e3:.1f} m from control point {name}, and nothing "
-                f"was stored: aim it at {name} and measure again; if the station itself was moved, stop the guide and "
-                "start another one with a new set-up",
+                f"the station's target is {distance_mm / 1e3:.1f} m from control point {name}, and nothing was stored: "
+                f"aim at {name} and measure again; if the station itself was moved, stop the guide and start a new one "
+                "with a new set-up",
                 REFUSED,
             )
         misclosure_mm = distance_mm if known else None
@@ -202,8 +204,8 @@ class StationSetups:
     def _known_place(self, setup_id: str, session_id: str, name: str, phase: str) -> dict[str, float] | None:
         """Return the known place of a control point; None if this shot defines it.
 
-        A point that only this session's start has shot, and that was not given with the set-up, is defined anew: the
-        operator shoots again because the shot before was no good.
+        A point that was shot only at this session's start, and whose place was not given with the set-up, is defined
+        again: the operator repeats the shot because the previous one was bad.
         """
         known = next((p for p in control_points(self._store, setup_id) if p["name"] == name), None)
         shots = self._table.point_shots(setup_id, name)
@@ -213,11 +215,11 @@ class StationSetups:
         return None if known is None else {axis: known[axis] for axis in AXES}
 
     def control_point_names(self, setup_id: str) -> list[str]:
-        """Names of a set-up's control points."""
+        """Return the names of a set-up's control points."""
         return [point["name"] for point in control_points(self._store, setup_id)]
 
     def control_points(self, setup_id: str) -> list[Place]:
-        """Places of a set-up's control points, mm in the station's frame."""
+        """Return the places of a set-up's control points, mm in the station's frame."""
         return [(p["x_mm"], p["y_mm"], p["z_mm"]) for p in control_points(self._store, setup_id)]
 
 

@@ -1,4 +1,4 @@
-"""Channel numbers of Vector logs (`.asc`, `.blf`), which these have in place of names, and the CAN links they are."""
+"""Mapping between CAN links and channel numbers in Vector logs (`.asc`, `.blf`), which contain no channel names."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ _NUMBERED = re.compile(r"can(\d{1,2})")
 
 
 def channel_numbers(config: Config, stored: Iterable[str] = ()) -> dict[str, int]:
-    """Return the number, from 1, of each CAN link in Vector logs.
+    """Return the channel number, from 1, of each CAN link in Vector logs.
 
-    `can0` is number 1, `can1` number 2, by a link's name or else its channel. Links that are called otherwise get the
-    numbers that are left, in the order of the configuration.
+    A link whose name, or else whose channel, is `can0` gets number 1, `can1` number 2, and so on. Other links get the
+    remaining numbers in the order of the configuration.
 
     Args:
-        config: names the links.
+        config: the configuration, which names the links.
         stored: further CAN links, which are no longer configured.
     """
     names = [*dict.fromkeys([section.name for section in config.can] + list(stored))]
@@ -39,16 +39,16 @@ def channel_numbers(config: Config, stored: Iterable[str] = ()) -> dict[str, int
 
 
 def links_of_channels(path: Path, config: Config, told: Mapping[str, int]) -> dict[str, str]:
-    """Return channel name, as `read_can_log` gives it -> link, for a Vector log.
+    """Return channel name, as given by `read_can_log` -> link, for a Vector log.
 
     Args:
         path: the log.
-        config: names the links.
-        told: link -> its number, by the session file of the log; empty where that does not say it.
+        config: the configuration, which names the links.
+        told: link -> channel number, from the session file of the log; empty where that does not contain it.
 
     Raises:
-        DescriptionError: the log is malformed; or it has frames of one channel alone, several links are configured, and
-            its name is not that of the channel's link.
+        DescriptionError: the log is malformed; or it has frames of one channel only, several links are configured, and
+            the file's name is not that of the channel's link.
     """
     numbers = {name: number for name, number in told.items() if name in {section.name for section in config.can}}
     if told:
@@ -62,21 +62,22 @@ def links_of_channels(path: Path, config: Config, told: Mapping[str, int]) -> di
         if only in known and ending and known[only] not in ending:
             raise DescriptionError(
                 str(path),
-                f"has frames of link {known[only]!r} by the channel number of this configuration, and of "
-                f"{ending[0]!r} by the file's name: links may have had other numbers where it was made; give the "
-                f"session file of the export with --session, or rename the file if it is of {known[only]!r}",
+                f"has frames of link {known[only]!r} according to the channel number in this configuration, but of "
+                f"{ending[0]!r} according to the file's name: links may have had other numbers where the file was "
+                "made; give the session file of the export with --session, or rename the file if it is of "
+                f"{known[only]!r}",
             )
     return known
 
 
 def links_named_by(path: Path, names: Iterable[str]) -> list[str]:
-    """Return the links by which an exported log may be named, the one of the longest name first."""
+    """Return the links after which an exported log may be named, longest name first."""
     ending = [name for name in names if path.stem == name or path.stem.endswith(f"-{name}")]
     return sorted(ending, key=len, reverse=True)
 
 
 def _only_channel(path: Path) -> str | None:
-    """Return the channel of all frames of a log; None where these have several, or where there are none."""
+    """Return the channel of all frames of a log; None if there are several channels, or no frames."""
     first = None
     for capture in read_can_log(path):
         if first is None:
@@ -87,12 +88,12 @@ def _only_channel(path: Path) -> str | None:
 
 
 def _named_first(path: Path, ending: Sequence[str], names: Sequence[str]) -> str:
-    """Return the link by which a log of channel 1 is named: the exported files of all links once had that channel."""
+    """Return the link after which a log of channel 1 is named; earlier versions exported every link as channel 1."""
     if not ending:
         raise DescriptionError(
             str(path),
-            f"has frames of channel 1 alone, which was every link's in exports of earlier versions, and its name ends "
-            f"in that of no link: name the file ...-LINK{path.suffix}, with LINK one of {', '.join(names)}; or give "
-            "the session file of an export with --session",
+            "has frames of channel 1 only, which earlier versions used for every exported link, and its name does not "
+            f"end with a link: name the file ...-LINK{path.suffix}, with LINK one of {', '.join(names)}; or give the "
+            "session file of an export with --session",
         )
     return ending[0]

@@ -4,14 +4,14 @@ A chunk holds captures of one link and one boot. Layout, little endian:
 
     magic "RCAP", version u8 = 1 to 3, kind u8 (1 CAN, 2 serial), packing u8 (0 plain, 1 zlib, 2 LZMA2), u8 = 0,
     count u32, body length u32 (before packing), link length u16, boot length u16, link UTF-8, boot UTF-8,
-    body (packed), CRC-32 of all that precedes u32
+    body (packed), CRC-32 of all preceding bytes u32
 
-The body is columns, not rows, and each column of integers is stored byte plane by byte plane, first all lowest bytes:
-neighbours resemble each other, which is what makes a fast compressor effective. Columns: differences of monotonic_ns
-i64 (the first from zero), differences of utc_ns - monotonic_ns i64 (the first from zero), CAN only: arbitration_id
-u32; flags u8; data length u32; then the data of all captures. Version 2 is that of chunks in which a capture has the
-flag 16, its time is doubtful: a program that does not know the flag must not take the time for known. Version 3 is that
-of large chunks, which many small ones were put together to; packed_captures.py has their body.
+The body consists of columns, not rows. Each column of integers is stored byte plane by byte plane, lowest bytes first,
+because neighbouring bytes are then similar and a fast compressor is effective. Columns: differences of monotonic_ns i64
+(the first from zero), differences of utc_ns - monotonic_ns i64 (the first from zero), CAN only: arbitration_id u32;
+flags u8; data length u32; then the data of all captures. Version 2 marks chunks in which a capture has flag 16 (its
+time is doubtful), so that a program that does not know the flag cannot treat the time as known. Version 3 marks large
+chunks, which were merged from many small ones; packed_captures.py describes their body.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _PLAIN, _ZLIB, _LZMA2 = 0, 1, 2
 _HEADER = struct.Struct("<4sBBBxIIHH")
 _CRC = struct.Struct("<I")
 _EXTENDED, _REMOTE, _ERROR, _TRANSMITTED, _TIME_DOUBTFUL = 1, 2, 4, 8, 16
-_FASTEST = 1  # zlib level: three quarters of what level 6 gains, in a fifth of its time
+_FASTEST = 1  # zlib level: saves three quarters of what level 6 saves, in a fifth of its time
 _FILTERS = [{"id": lzma.FILTER_LZMA2, "preset": 6}]
 
 
@@ -46,11 +46,11 @@ class Chunk:
     """An encoded run of captures.
 
     Attributes:
-        link: the link they crossed.
+        link: link of the captures.
         kind: `can` or `serial`.
         first, last: stamps of the first and the last capture.
-        captures: how many.
-        payload_bytes: sum of their data.
+        captures: number of captures.
+        payload_bytes: total size of their data.
         blob: the chunk itself.
     """
 
@@ -68,9 +68,9 @@ class CaptureRun:
     """Captures of one link and one boot.
 
     Attributes:
-        link: the link they crossed.
-        boot_id: the boot of their stamps.
-        is_serial: a serial link's, not those of a CAN bus.
+        link: link of the captures.
+        boot_id: boot of their stamps.
+        is_serial: whether the link is serial; otherwise it is a CAN bus.
         columns: the captures.
     """
 
@@ -81,7 +81,7 @@ class CaptureRun:
 
 
 def encode_captures(captures: Sequence[Capture]) -> list[Chunk]:
-    """Chunks of `captures` (any links, any order): one per link and boot, each in order; links as they first appear.
+    """Encode captures of any links as chunks: one per run of one link, boot and type; links as they first appear.
 
     Raises:
         StoreError: a field does not fit its column (an arbitration id beyond 32 bits).
@@ -115,7 +115,7 @@ def _encode(link: str, captures: list[Capture]) -> Chunk:
 
 
 def encode_large(run: CaptureRun) -> Chunk:
-    """One large chunk: smaller than those of `encode_captures`, and slower to make."""
+    """Encode captures as one large chunk, which is smaller than those of `encode_captures` and slower to make."""
     body = packed(run.columns, is_serial=run.is_serial)
     shorter = lzma.compress(body, lzma.FORMAT_RAW, filters=_FILTERS)
     return _chunk(run, _VERSION_LARGE, _LZMA2, shorter, len(body))
@@ -166,10 +166,10 @@ def _flags(capture: Capture) -> int:
 
 
 def decode_captures(blob: bytes) -> list[Capture]:
-    """The captures of a chunk, equal to those that were encoded.
+    """Return the captures of a chunk, equal to those that were encoded.
 
     Raises:
-        StoreError: as `decode_run`.
+        StoreError: as for `decode_run`.
     """
     run = decode_run(blob)
     columns, flags = run.columns, run.columns.flags.tolist()
@@ -190,32 +190,32 @@ def decode_captures(blob: bytes) -> list[Capture]:
 
 
 def require_sound(blob: bytes) -> None:
-    """Check what can be checked of a chunk without decoding it, in a hundredth of the time.
+    """Check header and checksum of a chunk without decoding it, in a hundredth of the time.
 
     Raises:
-        StoreError: the chunk is truncated, damaged, or of a version that this program does not know.
+        StoreError: the chunk is truncated, damaged, or of an unknown version.
     """
     if len(blob) < _HEADER.size + _CRC.size or blob[:4] != _MAGIC:
         raise StoreError(f"not a chunk of captures ({len(blob)} bytes)")
     if not _VERSION <= blob[4] <= _VERSION_LARGE:
         known = f"{_VERSION} to {_VERSION_LARGE}"
-        raise StoreError(f"chunk of captures has version {blob[4]}, this program reads {known}; use a newer one")
+        raise StoreError(f"chunk of captures has version {blob[4]}, but this rigcal reads {known}; use a newer rigcal")
     if _CRC.unpack_from(blob, len(blob) - _CRC.size)[0] != zlib.crc32(blob[: -_CRC.size]):
         raise StoreError("chunk of captures is damaged (its CRC-32 does not match); restore the store from a backup")
 
 
 def decode_run(blob: bytes) -> CaptureRun:
-    """The captures of a chunk as columns.
+    """Return the captures of a chunk as columns.
 
     Raises:
-        StoreError: the chunk is truncated, damaged, or of a version that this program does not know.
+        StoreError: the chunk is truncated, damaged, or of an unknown version.
     """
     require_sound(blob)
     try:
         return _decode(blob)
     except (ArithmeticError, LookupError, TypeError, ValueError, lzma.LZMAError, zlib.error) as error:
-        # Its CRC-32 is right, so it was written so: not by this program, or on a broken computer.
-        raise StoreError(f"chunk of captures makes no sense ({error}); restore the store from a backup") from error
+        # The CRC-32 is right, so the chunk was written wrong: by a different program, or on a faulty computer.
+        raise StoreError(f"chunk of captures is invalid ({error}); restore the store from a backup") from error
 
 
 def _decode(blob: bytes) -> CaptureRun:
@@ -230,7 +230,7 @@ def _decode(blob: bytes) -> CaptureRun:
     elif packing == _LZMA2:
         body = lzma.LZMADecompressor(lzma.FORMAT_RAW, filters=_FILTERS).decompress(body, body_length + 1)
     if len(body) != body_length:
-        raise ValueError(f"{len(body)} bytes or more where its header says {body_length}")
+        raise ValueError(f"{len(body)} bytes or more, but the header gives {body_length}")
     read = unpacked if version == _VERSION_LARGE else _small
     return CaptureRun(link, boot_id, kind != _CAN, read(body, count, is_serial=kind != _CAN))
 

@@ -1,8 +1,8 @@
-"""The one connection that writes: its lock, its transactions, and rows by table and column.
+"""The single writing connection: its lock, its transactions, and rows by table and column.
 
-WAL with synchronous=FULL: what `transaction` has committed survives power loss. One connection writes and
-checkpoints, because SQLite up to 3.51.2 can corrupt a WAL that two connections reset at once; readers
-(`daemon.store.reader`, and `rows` outside a transaction) are read-only, and wait for no commit.
+WAL with synchronous=FULL: whatever `transaction` has committed survives power loss. Only one connection writes and
+checkpoints, because SQLite up to 3.51.2 can corrupt a WAL that two connections reset at the same time. Readers
+(`daemon.store.reader`, and `rows` outside a transaction) are read-only and do not wait for commits.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ log = logging.getLogger(__name__)
 
 T = TypeVar("T")
 
-OLDEST_SQLITE = (3, 38, 0)  # STRICT tables (3.37) and JSON built in (3.38)
-CLOSE_TIMEOUT_S = 5.0  # a thread that hangs in a commit keeps its turn for ever
+OLDEST_SQLITE = (3, 38, 0)  # STRICT tables (3.37) and built-in JSON (3.38)
+CLOSE_TIMEOUT_S = 5.0  # a thread that hangs in a commit never releases its turn
 
 
 class Connection:
@@ -43,13 +43,13 @@ class Connection:
         path: the database; by convention it ends in `.sqlite`.
 
     Attributes:
-        files: which files it is made of, as they were when it was opened.
-        damage: the first damage that was met while it was used; "" as long as there was none.
+        files: the files of the database, as they were when it was opened.
+        damage: the first damage found while it was used; "" if there was none.
 
     Raises:
         StoreBusyError: another process writes to it.
-        StoreError: it is no such database, is damaged or half restored, was made by a newer rigcal, its directory
-            cannot be used, or the disk is full.
+        StoreError: the file is not a store, is damaged or only partly restored, or was made by a newer rigcal; or its
+            directory cannot be used, or the disk is full.
     """
 
     def __init__(self, path: Path) -> None:
@@ -58,8 +58,8 @@ class Connection:
             wanted = ".".join(map(str, OLDEST_SQLITE))
             raise StoreError(f"SQLite {sqlite3.sqlite_version} is too old; rigcal needs {wanted} or newer")
         self._turn = threading.RLock()
-        self._transactions = threading.local()  # how many of this thread are open, one in the other
-        self._afterwards: list[Callable[[], object]] = []  # of the transaction that is open
+        self._transactions = threading.local()  # number of nested open transactions of this thread
+        self._afterwards: list[Callable[[], object]] = []  # calls to make once the open transaction is committed
         self._reading = threading.Lock()
         self._lock = WriterLock(path)
         try:
@@ -72,7 +72,7 @@ class Connection:
                 self._prepare(connection)
                 self._reads = sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True, check_same_thread=False)
                 self._reads.text_factory = stored_text
-                self._reads.execute("PRAGMA schema_version").fetchall()  # opens its files, whose names may go
+                self._reads.execute("PRAGMA schema_version").fetchall()  # opens its files before they may be renamed
             except BaseException:
                 connection.close()
                 raise
@@ -97,33 +97,33 @@ class Connection:
         if later := unknown_migrations(self._db):
             raise StoreError(f"{self.path}: made by a newer rigcal (it has {later[0]}); install that version")
         if pending_migrations(self._db):
-            drop_views(self._db)  # a table that a view reads cannot be changed
+            drop_views(self._db)  # a table cannot be changed while a view reads it
         MIGRATIONS.apply(self._db)
         self._show_views()
-        # What a statement may undo needs no file, hence no descriptor. Not before: an index of a large store is sorted
-        # in files, where memory would not hold it.
+        # Statement journals then need no file, and so no descriptor. Set only now, because a migration may sort the
+        # index of a large store in files where the memory is too small.
         connection.execute("PRAGMA temp_store = MEMORY")
 
     def _show_views(self) -> None:
-        """Make the views for the joints and signals that the store knows; a damaged store is opened without."""
+        """Create the views for the joints and signals of the store; a damaged store is opened without them."""
         try:
             make_views(self._db)
         except sqlite3.DatabaseError as error:
             if not is_damage(error):
                 raise
-            log.error("%s: damaged, so its views may not be those of its channels: %s", self.path, error)
+            log.error("%s: damaged, so its views may not match its channels: %s", self.path, error)
 
     def close(self) -> None:
-        """Close the database and let others write to it; harmless when it was closed before.
+        """Close the database and release its lock; harmless if it is closed already.
 
-        Where a thread hangs in a commit, the database stays open and locked until the process ends.
+        If a thread hangs in a commit, the database stays open and locked until the process ends.
         """
         if not self._turn.acquire(timeout=CLOSE_TIMEOUT_S):
-            log.error("%s: a write does not end; the store is left open", self.path)
+            log.error("%s: a write does not finish; the store is left open", self.path)
             return
         try:
             with self._reading:
-                self._reads.close()  # first: the last one to close tidies the write-ahead log away
+                self._reads.close()  # first, because the last connection to close removes the write-ahead log
             self._db.close()
             self._lock.release()
         finally:
@@ -133,7 +133,7 @@ class Connection:
 
     @contextmanager
     def transaction(self) -> Iterator[Database]:
-        """A transaction: committed, durably, when the block ends, rolled back when it raises.
+        """Open a transaction: committed durably when the block ends, rolled back when it raises.
 
         Nested transactions are savepoints of the outermost one. Other threads wait for their turn.
         """
@@ -156,12 +156,12 @@ class Connection:
                     work()
 
     def once_committed(self, work: Callable[[], object]) -> None:
-        """Do `work` when all transactions that this thread is in are committed, and never if one is rolled back.
+        """Call `work` once all open transactions of this thread are committed; never if one is rolled back.
 
-        What is in memory thus changes after the store, and before another thread can store anything.
+        Memory thus changes after the store, and before another thread can store anything.
 
         Args:
-            work: it must be quick, as other threads wait. Outside a transaction it is done at once.
+            work: must be quick, because other threads wait. Outside a transaction it is called at once.
         """
         if self._depth:
             self._afterwards.append(work)
@@ -170,27 +170,31 @@ class Connection:
 
     @property
     def _depth(self) -> int:
-        """Number of transactions that this thread is in, one inside the other."""
+        """Number of nested open transactions of this thread."""
         return getattr(self._transactions, "depth", 0)
 
     def _forget_rows(self) -> None:
-        """Empty the caches of row numbers: a transaction that made some of these rows was rolled back."""
+        """Empty the caches of row numbers, because a transaction that created some of the rows was rolled back."""
         self._boots.clear()
         self._boot_ids = {}  # a new one: another thread may be looking something up in the old one
 
     def reader(self) -> Reader:
-        """A read-only view of this very store, for what the writing connection must not wait for.
+        """Open a read-only view of this store, for queries that must not delay the writing connection.
 
         Raises:
-            StoreError: its file was replaced, moved or removed.
+            StoreError: the store's file was replaced, moved or removed.
         """
         return Reader(self.path, self.files.database)
 
     def insert(self, table: str, row: Mapping[str, object]) -> int:
-        """Insert one row; numpy scalars, NaN, lists and mappings are made storable (`rows.sql_value`).
+        """Insert one row; numpy scalars, NaN, lists and mappings are converted (`rows.sql_value`).
+
+        Args:
+            table: name of the table.
+            row: column -> value.
 
         Returns:
-            its rowid.
+            Its rowid.
         """
         names = ", ".join(f'"{name}"' for name in row)
         with self.transaction() as db:
@@ -202,8 +206,13 @@ class Connection:
     def update(self, table: str, where: Mapping[str, object], changes: Mapping[str, object]) -> int:
         """Change the rows whose columns equal `where`.
 
+        Args:
+            table: name of the table.
+            where: column -> value that selects the rows.
+            changes: column -> new value.
+
         Returns:
-            how many there were.
+            Number of rows changed.
         """
         settings = ", ".join(f'"{name}" = ?' for name in changes)
         conditions = " AND ".join(f'"{name}" IS ?' for name in where)
@@ -212,9 +221,13 @@ class Connection:
             return db.execute(f'UPDATE "{table}" SET {settings} WHERE {conditions}', values).rowcount
 
     def rows(self, sql: str, parameters: Sequence[object] = ()) -> list[dict[str, Any]]:
-        """The rows of a query: in a transaction of this thread with its changes, else as last committed, at once.
+        """Return the rows of a query: with the changes of this thread's open transaction, otherwise as last committed.
 
-        What is read outside a transaction waits for no other thread's: a commit takes as long as the disk does.
+        Outside a transaction the query does not wait for transactions of other threads, whose commits may be slow.
+
+        Args:
+            sql: the query.
+            parameters: values of its placeholders.
         """
         lock, connection = (self._turn, self._db.conn) if self._depth else (self._reading, self._reads)
         with lock:
@@ -227,14 +240,14 @@ class Connection:
                 raise
 
     def note_damage(self, error: BaseException) -> None:
-        """Remember what was raised where the store was used, if it tells that the store is damaged."""
+        """Remember an error raised while using the store, if it shows that the store is damaged."""
         if is_damage(error):
             self.damage = self.damage or str(error)
 
     def unless_damaged(self, work: Callable[[], T], otherwise: T) -> T:
-        """Return what `work` returns; `otherwise` where a table is damaged: the daemon starts all the same.
+        """Return the result of `work`, or `otherwise` if a table is damaged, so that the daemon can still start.
 
-        The damage is logged and remembered, so that an alarm tells of it.
+        The damage is logged and remembered, so that an alarm is raised.
         """
         try:
             return work()
@@ -246,16 +259,16 @@ class Connection:
             return otherwise
 
     def number(self, sql: str, parameters: Sequence[object]) -> int | None:
-        """The integer in the first column of a query's first row; None where there is no row."""
+        """Return the integer in the first column of a query's first row; None if there is no row."""
         found = self.rows(sql, parameters)
         return int(next(iter(found[0].values()))) if found else None
 
     def pragma(self, name: str) -> int:
-        """The number that SQLite tells of the database: `page_count`, `page_size`, `freelist_count`."""
+        """Return a number that SQLite reports about the database: `page_count`, `page_size`, `freelist_count`."""
         return self.number(f"PRAGMA {name}", []) or 0
 
     def instant(self, stamp: Stamp, prefix: str = "") -> dict[str, SqlValue]:
-        """The three columns of an instant, to be merged into a row: `<prefix>utc_ns`, ..."""
+        """Return the three columns of an instant, to be merged into a row: `<prefix>utc_ns`, ..."""
         return {
             f"{prefix}utc_ns": stamp.utc_ns,
             f"{prefix}monotonic_ns": stamp.monotonic_ns,
@@ -263,18 +276,18 @@ class Connection:
         }
 
     def stamp_or_none(self, row: Mapping[str, object], prefix: str = "") -> Stamp | None:
-        """The instant in a row's `<prefix>utc_ns`, ...; None where they are NULL."""
+        """Return the instant in a row's columns `<prefix>utc_ns`, ...; None if they are NULL."""
         return None if row[f"{prefix}utc_ns"] is None else self.stamp(row, prefix)
 
     def stamp(self, row: Mapping[str, object], prefix: str = "") -> Stamp:
-        """The instant in a row's `<prefix>utc_ns`, ..., which are not NULL."""
+        """Return the instant in a row's columns `<prefix>utc_ns`, ..., which must not be NULL."""
         known = self._boot_ids
         if row[f"{prefix}boot_id"] not in known:
             known = self._boot_ids = {boot["id"]: boot["kernel_boot_id"] for boot in self.rows("SELECT * FROM boots")}
         return stamp_of(row, known, prefix)
 
     def boot_row(self, stamp: Stamp) -> int:
-        """The row of `boots` that `stamp` belongs to, made on first sight."""
+        """Return the row of `boots` to which `stamp` belongs; it is created if it does not exist."""
         row = self._boots.get(stamp.boot_id)
         if row is None:
             with self.transaction():
@@ -286,11 +299,16 @@ class Connection:
         return row
 
     def boots(self) -> list[str]:
-        """Names of the boots that anything was stored in, oldest first."""
+        """Return the kernel boot ids of all boots in the store, oldest first."""
         return [str(row["kernel_boot_id"]) for row in self.rows("SELECT kernel_boot_id FROM boots ORDER BY id")]
 
     def rig_file(self, rig: str, text: str) -> str:
-        """The SHA-256 of a rig file, which is stored on first sight."""
+        """Return the SHA-256 of a rig file, and store the file if it is new.
+
+        Args:
+            rig: name of the rig.
+            text: text of the rig file.
+        """
         sha256 = rig_sha256(text)
         with self.transaction() as db:
             row = [sha256, rig, text]
@@ -298,10 +316,10 @@ class Connection:
         return sha256
 
     def order(self, stamp: Stamp) -> tuple[int, int]:
-        """Place of an instant among all that the store knows (`drivers.clock.Order`)."""
+        """Return the sort key of an instant among all instants in the store (`drivers.clock.Order`)."""
         return self.boot_row(stamp), stamp.monotonic_ns
 
 
 def rig_sha256(text: str) -> str:
-    """Return the SHA-256 by which a rig file is known in the store."""
+    """Return the SHA-256 that identifies a rig file in the store."""
     return hashlib.sha256(text.encode()).hexdigest()

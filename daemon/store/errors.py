@@ -1,4 +1,4 @@
-"""Errors of the store, and the sentences that tell them."""
+"""Errors of the store, and their messages."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ _FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 _READ_ONLY = {errno.EROFS}
 _NO_PLACE = {errno.ENOENT, errno.ENOTDIR, errno.EACCES, errno.EPERM}
 
-# What a busy computer lacks for a while, whatever is asked of it.
+# Errors of a busy computer that temporarily lacks a resource.
 LACKING = frozenset({errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM, errno.EAGAIN})
-NOTHING_BYTES = 2**20  # a disk with less than this has no room
+NOTHING_BYTES = 2**20  # a disk with less free space than this counts as full
 _UNWRITABLE = {
     sqlite3.SQLITE_FULL,
     sqlite3.SQLITE_IOERR,
@@ -34,42 +34,43 @@ class StoreError(Exception):
 
 
 class NotInStoreError(StoreError):
-    """A row that is asked for by its name or number does not exist; the message says where they are listed."""
+    """There is no row of the requested name or number; the message names the command that lists the rows."""
 
 
 class StoreBusyError(StoreError):
     """Another process writes to this store.
 
     Attributes:
-        pid: that process, where it could be read.
+        pid: process id of that process; None if it could not be read.
     """
 
     def __init__(self, path: str, pid: int | None) -> None:
         holder = f"process {pid}" if pid is not None else "another process"
         super().__init__(
-            f"{path}: {holder} holds this store; stop it first (`rigcal status` shows it), or configure another file"
+            f"{path}: {holder} has this store open for writing; stop it first (`rigcal status` shows it), or configure "
+            "a different file"
         )
         self.pid = pid
 
 
 def is_unwritable(error: BaseException) -> bool:
-    """True if the disk, memory or another program's lock refused, for now. The transaction was rolled back."""
+    """Return True if a write failed for a passing reason: disk, memory or a lock. The transaction was rolled back."""
     code = getattr(error, "sqlite_errorcode", None) if isinstance(error, sqlite3.Error) else None
-    return code is not None and code & 0xFF in _UNWRITABLE  # the low byte; the rest says which read or write it was
+    return code is not None and code & 0xFF in _UNWRITABLE  # the low byte; the other bytes give the operation
 
 
 def is_damage(error: BaseException) -> bool:
-    """True if the file makes no sense where it was read."""
+    """Return True if the error shows that the database file is damaged."""
     code = getattr(error, "sqlite_errorcode", None) if isinstance(error, sqlite3.Error) else None
     return code is not None and code & 0xFF in (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
 
 
 def storage_sentence(path: Path, error: sqlite3.Error | OSError) -> str:
-    """Say in one sentence what the disk or SQLite refused to do with a file, and what to do about it.
+    """Return one sentence that states the failure of the disk or SQLite with a file, and what to do about it.
 
     Args:
-        path: of the store; an OSError that names a file is told with that name.
-        error: what was raised.
+        path: path of the store; for an OSError that names a file, that file is named instead.
+        error: the error.
     """
     if isinstance(error, OSError):
         path, reason, code = Path(error.filename or path), error.strerror or str(error), error.errno
@@ -80,7 +81,7 @@ def storage_sentence(path: Path, error: sqlite3.Error | OSError) -> str:
     place = _existing(path.parent)
     free_bytes = _free_bytes(place)
     free = "free space is unknown" if free_bytes is None else f"{free_bytes / 2**20:.0f} MiB free in {place}"
-    # On a full disk SQLite speaks of an I/O error where the log's index cannot grow.
+    # On a full disk SQLite reports an I/O error if the index of the write-ahead log cannot grow.
     is_full = name.startswith("SQLITE_IOERR") and free_bytes is not None and free_bytes < NOTHING_BYTES
     if is_full or code in _FULL or name == "SQLITE_FULL":
         return (
@@ -90,26 +91,26 @@ def storage_sentence(path: Path, error: sqlite3.Error | OSError) -> str:
     if code in _READ_ONLY or name.startswith("SQLITE_READONLY"):
         return (
             f"{path}: cannot be written ({reason}): {place} or the file is read-only; mount it for writing (`dmesg` "
-            f"tells whether the kernel found a fault of the disk) and let user {_user()} write to it"
+            f"shows whether the kernel found a disk fault) and let user {_user()} write to it"
         )
     if code in _NO_PLACE or name.startswith("SQLITE_CANTOPEN") or name == "SQLITE_PERM":
         return (
-            f"{path}: cannot be made or opened ({reason}): the directory must exist, and user {_user()} must be "
+            f"{path}: cannot be created or opened ({reason}): the directory must exist, and user {_user()} must be "
             "allowed to write to it"
         )
     if name.startswith(("SQLITE_CORRUPT", "SQLITE_NOTADB")):
         return f"{path}: cannot be used as a store ({reason}): move it away and restore the store from a backup"
     if name.startswith(("SQLITE_BUSY", "SQLITE_LOCKED")):
-        return f"{path}: another program holds it locked ({reason}): end that program (a `sqlite3` shell, a backup)"
-    return f"{path}: cannot be used ({reason}; {free}): check the disk, `dmesg` may tell what is wrong with it"
+        return f"{path}: locked by another program ({reason}): end that program (a `sqlite3` shell, a backup)"
+    return f"{path}: cannot be used ({reason}; {free}): check the disk; `dmesg` may show the fault"
 
 
 @contextlib.contextmanager
 def storage_errors(path: Path) -> Iterator[None]:
-    """Raise what disk and SQLite refuse as a StoreError that says what to do.
+    """Convert errors of disk and SQLite into a StoreError that states what to do.
 
     Args:
-        path: of the store.
+        path: path of the store.
 
     Raises:
         StoreError: in place of sqlite3.Error and OSError.
@@ -122,10 +123,10 @@ def storage_errors(path: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def unwritable_errors(path: Path) -> Iterator[None]:
-    """Raise what refuses for now as a StoreError that says what to do before a command is given again.
+    """Convert passing write errors into a StoreError that states what to do before the command is repeated.
 
     Args:
-        path: of the store.
+        path: path of the store.
 
     Raises:
         StoreError: in place of a sqlite3.Error that `is_unwritable`.
@@ -135,11 +136,13 @@ def unwritable_errors(path: Path) -> Iterator[None]:
     except sqlite3.Error as error:
         if not is_unwritable(error):
             raise
-        raise StoreError(f"{storage_sentence(path, error)}; nothing was changed, so give the command again") from error
+        raise StoreError(
+            f"{storage_sentence(path, error)}; nothing was changed, so repeat the command afterwards"
+        ) from error
 
 
 def _existing(directory: Path) -> Path:
-    """The directory, or the nearest one above it that can be looked at."""
+    """Return the directory, or its nearest accessible parent."""
     return next((place for place in (directory, *directory.parents) if os.access(place, os.F_OK)), Path("/"))
 
 

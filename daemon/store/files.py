@@ -1,7 +1,7 @@
-"""The files of a store: which they are, whatever they are called, and the lock of the one process that writes.
+"""The files of a store, identified independently of their names, and the lock of the one writing process.
 
-A name can come to mean another file while a program has the first one open. While a restore renames files, a note
-beside the database says so: one that was killed leaves it, and nobody takes half a store for an empty one.
+A name may come to denote a different file while a program has the original file open. While a restore renames files,
+there is a note beside the database; if the restore is killed, the note remains and marks the store as incomplete.
 """
 
 from __future__ import annotations
@@ -16,15 +16,15 @@ from pathlib import Path
 from daemon.host.safe_output import write_file
 from daemon.store.errors import StoreBusyError, StoreError, storage_errors
 
-BESIDE = ("", "-wal", "-shm")  # a database in WAL mode is three files
+BESIDE = ("", "-wal", "-shm")  # a database in WAL mode consists of three files
 
 
 @dataclass(frozen=True)
 class FileIdentity:
-    """A file, whatever it is called.
+    """Identity of a file, independent of its name.
 
     Attributes:
-        device, inode: as stat(2) has them.
+        device, inode: as in stat(2).
     """
 
     device: int
@@ -32,10 +32,10 @@ class FileIdentity:
 
     @classmethod
     def of(cls, path: Path) -> FileIdentity | None:
-        """The file at `path`; None where there is none.
+        """Return the identity of the file at `path`; None if there is no file.
 
         Raises:
-            OSError: the file system does not tell.
+            OSError: the file system cannot be read.
         """
         try:
             status = path.stat()
@@ -49,8 +49,8 @@ class StoreFiles:
     """The files of a store, as they were when it was opened.
 
     Attributes:
-        path: of the database.
-        identities: of the database, its write-ahead log and that log's index.
+        path: path of the database.
+        identities: identities of the database, its write-ahead log and the log's index.
     """
 
     path: Path
@@ -58,7 +58,7 @@ class StoreFiles:
 
     @classmethod
     def of(cls, path: Path) -> StoreFiles:
-        """The files of the store at `path`, which is open."""
+        """Return the files of the open store at `path`."""
         path = path.absolute()
         return cls(path, tuple(map(FileIdentity.of, database_files(path))))
 
@@ -68,10 +68,10 @@ class StoreFiles:
         return self.identities[0]
 
     def changed(self) -> tuple[Path, bool] | None:
-        """The first file that is not the one that was opened, and whether another lies in its place.
+        """Return the first file that is no longer the opened one, and whether a different file has replaced it.
 
         Raises:
-            OSError: the file system does not tell.
+            OSError: the file system cannot be read.
         """
         for path, opened in zip(database_files(self.path), self.identities, strict=True):
             now = FileIdentity.of(path)
@@ -82,12 +82,12 @@ class StoreFiles:
 
 @dataclass(frozen=True)
 class RestoreNote:
-    """A restore whose renames have begun and have not all been made.
+    """A restore that has begun to rename files and has not finished.
 
     Attributes:
-        backup: directory that is put in the store's place.
-        aside: name of the directory beside the store that what was there is moved to.
-        replaced: names of files and directories that are moved there.
+        backup: directory of the backup that replaces the store.
+        aside: name of the directory beside the store to which the replaced files are moved.
+        replaced: names of the files and directories that are moved there.
     """
 
     backup: str
@@ -96,10 +96,10 @@ class RestoreNote:
 
     @classmethod
     def of(cls, database: Path) -> RestoreNote | None:
-        """The note beside a database; None where no restore was cut off.
+        """Return the note beside a database; None if no restore was interrupted.
 
         Raises:
-            StoreError: it cannot be read.
+            StoreError: the note cannot be read.
         """
         path = restore_note_path(database)
         try:
@@ -108,42 +108,46 @@ class RestoreNote:
         except FileNotFoundError:
             return None
         except (OSError, ValueError, LookupError, TypeError) as error:
-            raise StoreError(f"{path}: the note of a restore that was cut off cannot be read ({error})") from error
+            raise StoreError(f"{path}: the note of an interrupted restore cannot be read ({error})") from error
 
     def write(self, database: Path) -> None:
-        """Write the note beside a database, durably; OSError where the file system refuses."""
+        """Write the note beside a database, durably.
+
+        Raises:
+            OSError: the file system refuses.
+        """
         write_file(restore_note_path(database), json.dumps(asdict(self)).encode() + b"\n")
 
 
 def restore_note_path(database: Path) -> Path:
-    """Return the path of the note that a restore keeps while it renames files."""
+    """Return the path of the note that exists while a restore renames files."""
     return _beside(database, ".restoring")
 
 
 def require_no_half_restore(database: Path) -> None:
-    """Refuse a store of which a restore has put a part in place and no more.
+    """Refuse a store that was only partly restored.
 
     Raises:
-        StoreError: a restore was cut off; the message says how to end it.
+        StoreError: a restore was interrupted; the message states how to complete it.
     """
     note = RestoreNote.of(database)
     if note is not None:
         raise StoreError(
-            f"{database}: a restore of {note.backup} was cut off, so store and models are not whole; run `rigcal store "
-            f"restore {note.backup}` again, with the same --config (what was replaced is kept in "
+            f"{database}: a restore of {note.backup} was interrupted, so store and models are incomplete; run `rigcal "
+            f"store restore {note.backup}` again, with the same --config (replaced files are kept in "
             f"{database.parent / note.aside})"
         )
 
 
 class WriterLock:
-    """The exclusive right to write to `database`; taken by the constructor.
+    """The exclusive right to write to `database`; acquired by the constructor.
 
-    A lock file beside the database is held for the life of the process. The kernel drops the lock when the process
-    ends, however it ends, so a stale file never needs to be removed.
+    A lock file beside the database is locked until it is released or the process ends. The kernel then drops the lock
+    in any case, so a stale file never needs to be removed.
 
     Raises:
-        StoreBusyError: another process (or another store of this one) has it.
-        StoreError: the lock file cannot be made or written.
+        StoreBusyError: another process (or another store in this process) holds the lock.
+        StoreError: the lock file cannot be created or written.
     """
 
     def __init__(self, database: Path) -> None:
@@ -156,13 +160,13 @@ class WriterLock:
             text = os.pread(self._file, 32, 0).strip()
             os.close(self._file)
             raise StoreBusyError(str(database), int(text) if text.isdigit() else None) from None
-        # Who holds it is for people; on a full disk the lock holds without.
+        # The process id is only informative; on a full disk the lock works without it.
         with contextlib.suppress(OSError):
             os.ftruncate(self._file, 0)
             os.pwrite(self._file, f"{os.getpid()}\n".encode(), 0)
 
     def release(self) -> None:
-        """Give the right up; harmless when it was given up before."""
+        """Release the lock; harmless if it is released already."""
         if self._file >= 0:
             with contextlib.suppress(OSError):
                 os.ftruncate(self._file, 0)
@@ -171,7 +175,7 @@ class WriterLock:
 
 
 def database_files(database: Path) -> list[Path]:
-    """Return the files of a database: SQLite has the other two beside the file itself, whatever links lead to it."""
+    """Return the files of a database; SQLite puts the other two beside the file to which links lead."""
     return [database, *(_beside(database.resolve(), suffix) for suffix in BESIDE[1:])]
 
 

@@ -1,7 +1,7 @@
-"""Health of the store: its files are those that were opened, sound, and have room to grow.
+"""Health of the store: its files are the opened ones, are sound, and have space to grow.
 
-A run that ended without order (a power cut, a kill, a full disk), or that met with damage, is followed by SQLite's
-`quick_check`, beside acquisition. Files are looked at with every beat of the daemon.
+After an unclean shutdown (a power cut, a kill, a full disk), or after damage was found, SQLite's `quick_check` is run
+at the next start, in parallel with acquisition. The files are checked with every heartbeat of the daemon.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ log = logging.getLogger(__name__)
 
 HealthState = Literal["ok", "checking", "damaged", "replaced", "missing"]
 
-AT_START_S = 3.0  # a small store is checked by then, and its state known from the beginning
+AT_START_S = 3.0  # wait for the check at the start, so that the state of a small store is known from the beginning
 STOP_S = 5.0
 LOW_BYTES = 2**30
 LOW_SHARE = 0.05
 LOW_SHARE_MOST_BYTES = 10 * 2**30
 FINDINGS = 5
 RETRY_S = 5.0
-# What keeps a check from being made and says nothing of the store: no descriptors, no memory, a lock, a full disk.
+# Errors that prevent a check but do not concern the store: no descriptors, no memory, a lock, a full disk.
 _HINDRANCES = {
     sqlite3.SQLITE_CANTOPEN,
     sqlite3.SQLITE_NOMEM,
@@ -49,12 +49,12 @@ class StoreHealth:
     """Health of the store.
 
     Attributes:
-        state: ok; checking: it is being searched for damage; damaged: damage was found; replaced, missing: a file of
-            it is not the one that the daemon has open, or has no name any more.
-        text: what is wrong and what to do, a sentence; "" when all is well.
-        since: when it came to be so.
-        free_bytes: free space where the store lies; None where the file system does not tell.
-        is_low: less than 1 GiB is free, or less than 5 % of the disk and 10 GiB.
+        state: ok; checking: it is being checked for damage; damaged: damage was found; replaced, missing: a file of it
+            is not the one that the daemon has open, or was removed.
+        text: what is wrong and what to do, a sentence; "" if nothing is wrong.
+        since: when it entered this state.
+        free_bytes: free space on the store's disk; None if the file system cannot be read.
+        is_low: less than 1 GiB is free, or less than both 5 % of the disk and 10 GiB.
     """
 
     state: HealthState
@@ -69,7 +69,7 @@ class StoreHealth:
         return self.state in ("damaged", "replaced", "missing")
 
     def as_dict(self) -> dict[str, Any]:
-        """As `status` tells it."""
+        """Return the health as `status` shows it."""
         return {
             "state": self.state,
             "text": self.text,
@@ -80,27 +80,27 @@ class StoreHealth:
 
 
 class StoreWatch:
-    """Watches over a store that is open for writing.
+    """Monitors a store that is open for writing.
 
     Args:
-        store: with a run begun.
-        clock: for when what was found.
+        store: the store; a run must have begun.
+        clock: clock for the instants of findings.
 
     Attributes:
-        health: how the store is; to be read from any thread.
+        health: present health of the store; may be read from any thread.
     """
 
     def __init__(self, store: Store, clock: Clock) -> None:
         self._store, self._clock = store, clock
-        self._findings: str | None = None  # of the check; None until it has come to its end
-        self._told = ""  # the fault of the check that the log has last
+        self._findings: str | None = None  # result of the check; None until it has finished
+        self._told = ""  # the error of the check that was logged last
         self._stopping = threading.Event()
         self._connection: sqlite3.Connection | None = None
         self._check: threading.Thread | None = None
         self.health = StoreHealth("ok", "", clock.now(), None, is_low=False)
 
     def start(self) -> None:
-        """Begin the check for damage, if one is due, and wait a moment for its end."""
+        """Start the check for damage, if one is due, and wait a short time for its end."""
         if not self._store.ended_in_order or self._is_unsettled():
             self._check = threading.Thread(target=self._search, name="store-check", daemon=True)
             self._check.start()
@@ -108,7 +108,7 @@ class StoreWatch:
         self.look()
 
     def stop(self) -> None:
-        """End a check that is under way; the next start makes it again."""
+        """Stop a running check; the next start repeats it."""
         self._stopping.set()
         budget = TimeBudget(STOP_S)
         while self._check is not None and self._check.is_alive() and not budget.is_over:
@@ -118,7 +118,7 @@ class StoreWatch:
             self._check.join(0.05)
 
     def look(self) -> None:
-        """Look at files and free space; costs microseconds, unless the file system hangs."""
+        """Check files and free space; takes microseconds, unless the file system hangs."""
         state, text = self._state()
         free_bytes, is_low = _space(self._store.path.parent)
         before = self.health
@@ -129,35 +129,35 @@ class StoreWatch:
         if text:
             log.log(logging.INFO if state == "checking" else logging.CRITICAL, "%s", text)
         else:
-            log.info("%s: the store is well again", self._store.path)
+            log.info("%s: the store is sound again", self._store.path)
 
     def _state(self) -> tuple[HealthState, str]:
         path = self._store.path
         try:
             changed = self._store.files.changed()
         except OSError as error:
-            return "missing", f"{path}: cannot be looked at ({error.strerror}): check the disk, `dmesg` may tell why"
+            return "missing", f"{path}: cannot be accessed ({error.strerror}): check the disk; `dmesg` may show why"
         if changed is not None:
             name, is_replaced = changed
-            found = "another file lies in place of the one" if is_replaced else "the file is gone"
+            found = "was replaced by another file" if is_replaced else "is gone"
             return "replaced" if is_replaced else "missing", (
-                f"{name}: {found} that rigcal writes to, and what it records now is lost when it stops: move the file "
-                f"back if it was moved; else save it first{self._copies()}, and then restart rigcal"
+                f"{name}: the file that rigcal writes to {found}, and its data are lost when rigcal stops: move the "
+                f"file back if it was moved; otherwise save it first{self._copies()}, then restart rigcal"
             )
         if damage := self._findings or self._store.damage:
             return "damaged", (
-                f"{path}: the store is damaged ({damage}); acquisition goes on, jobs do not run, and nothing "
-                "that is read from it can be trusted: stop rigcal, keep the file, and restore the store from a backup"
+                f"{path}: the store is damaged ({damage}); acquisition continues, but jobs do not run, and stored data "
+                "cannot be trusted: stop rigcal, keep the file, and restore the store from a backup"
             )
         if self._check is not None and self._findings is None:
             return "checking", (
-                f"{path}: the last run did not end in order, so the store is being checked for damage; acquisition "
-                "goes on, and jobs wait"
+                f"{path}: the last shutdown was unclean, so the store is being checked for damage; acquisition "
+                "continues, and jobs wait"
             )
         return "ok", ""
 
     def _copies(self) -> str:
-        """Commands that copy the open files, which have no name any more; "" where they cannot be told."""
+        """Return shell commands that copy the open files, which have lost their names; "" if they are not found."""
         open_files = {}
         for fd in _descriptors():
             with contextlib.suppress(OSError):
@@ -173,7 +173,7 @@ class StoreWatch:
     # ---- the check for damage ----------------------------------------------------------------------------------------
 
     def _is_unsettled(self) -> bool:
-        """True if the newest check never came to its end, or found damage."""
+        """Return True if the newest check did not finish, or found damage."""
         try:
             checks = self._store.rows("SELECT result FROM store_checks ORDER BY id DESC LIMIT 1")
         except sqlite3.Error:
@@ -188,20 +188,20 @@ class StoreWatch:
                 return
 
     def _has_searched(self, check: _CheckRow) -> bool:
-        """Make the check; False if it was stopped or cannot be made."""
+        """Run the check; return False if it was stopped or cannot be run."""
         try:
-            check.note(self._clock.now(), "started_")  # without a result, until there is one
+            check.note(self._clock.now(), "started_")  # the result is added at the end
             self._findings = self._damage()
             if self._findings is not None:
                 check.note(self._clock.now(), "ended_", result=self._findings or SOUND)
-        except Exception as error:  # a fault of rigcal: a store that nobody has checked is not known to be sound
+        except Exception as error:  # a fault of rigcal: without a finished check the store is not known to be sound
             if str(error) != self._told:
-                log.exception("%s: the check for damage has failed; it is made again", self._store.path)
+                log.exception("%s: the check for damage has failed; retrying", self._store.path)
             self._told = str(error)
         return self._findings is not None
 
     def _damage(self) -> str | None:
-        """Search for damage: its description, "" if there is none; None if the check was stopped or cannot be made."""
+        """Return a description of damage, "" if there is none; None if the check was stopped or cannot be run."""
         try:
             uri = f"{self._store.path.absolute().as_uri()}?mode=ro"
             connection = sqlite3.connect(uri, uri=True, check_same_thread=False)
@@ -213,7 +213,7 @@ class StoreWatch:
         except MemoryError:
             return None
         except sqlite3.DatabaseError as error:
-            code = getattr(error, "sqlite_errorcode", None)  # a text that is none has no code, and is damage
+            code = getattr(error, "sqlite_errorcode", None)  # no code: invalid text, which is damage
             if self._stopping.is_set() or (code is not None and code & 0xFF in _HINDRANCES):
                 return None
             return str(error)
@@ -223,7 +223,7 @@ class StoreWatch:
 
 
 class _CheckRow:
-    """A check's row in the store, written as soon as the store takes it: a full disk keeps no check from being made."""
+    """A check's row in the store, written as soon as possible: a check also runs while the disk is full."""
 
     def __init__(self, store: Store) -> None:
         self._store = store
@@ -231,7 +231,13 @@ class _CheckRow:
         self._id: int | None = None
 
     def note(self, now: Stamp, prefix: str, **about: str) -> None:
-        """Write down that the check has begun or ended."""
+        """Store the start or the end of the check.
+
+        Args:
+            now: the instant.
+            prefix: `started_` or `ended_`.
+            about: further columns of the row.
+        """
         try:
             self._row |= {**self._store.instant(now, prefix), **about}
             if self._id is None:
@@ -239,7 +245,7 @@ class _CheckRow:
             else:
                 self._store.update("store_checks", {"id": self._id}, self._row)
         except sqlite3.Error as error:
-            log.error("the store's check is not written down: %s", storage_sentence(self._store.path, error))
+            log.error("the store's check cannot be recorded: %s", storage_sentence(self._store.path, error))
 
 
 def _space(directory: Path) -> tuple[int | None, bool]:

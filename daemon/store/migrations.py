@@ -1,8 +1,8 @@
-"""The store's schema, by migrations that are applied in order and never edited once released.
+"""The store's schema, as migrations that are applied in order and never changed once released.
 
-Conventions: every table is STRICT. An instant is three columns, `utc_ns`, `monotonic_ns` and `boot_id` (-> boots),
-with a prefix where a row has several (`started_utc_ns`, ...). NULL is "bad" or "not there" and a status or reason
-column beside it says which. Columns that end in `_json` hold JSON text.
+Conventions: every table is STRICT. An instant is stored in three columns, `utc_ns`, `monotonic_ns` and `boot_id`
+(-> boots), with a prefix where a row has several instants (`started_utc_ns`, ...). NULL means a bad or missing value; a
+status or reason column shows which. Columns that end in `_json` contain JSON text.
 """
 
 from __future__ import annotations
@@ -36,21 +36,21 @@ def m001_runs_and_raw_captures(db: Database) -> None:
     """Boots, runs of the daemon, links, and every captured byte."""
     _create(
         db,
-        # One row per boot of a host. booted_utc_ns: when its monotonic clock was zero, by its first record.
+        # One row per boot of a host. booted_utc_ns: UTC at which its monotonic clock was zero, by its first record.
         """CREATE TABLE boots (id INTEGER PRIMARY KEY, kernel_boot_id TEXT NOT NULL UNIQUE,
             booted_utc_ns INTEGER NOT NULL) STRICT""",
-        # One row per life of the daemon. alive_: when it was last known to run; clean: it ended in order.
+        # One row per run of the daemon. alive_: when it was last known to be alive; clean: it shut down cleanly.
         f"""CREATE TABLE daemon_runs (id INTEGER PRIMARY KEY, pid INTEGER NOT NULL, software_version TEXT NOT NULL,
             sqlite_version TEXT NOT NULL, {_instant("started_")}, {_instant("alive_")},
             {_instant("ended_", optional=True)}, clean INTEGER NOT NULL DEFAULT 0 CHECK (clean IN (0, 1))) STRICT""",
         f"""CREATE TABLE links (id INTEGER PRIMARY KEY, name TEXT NOT NULL UNIQUE,
             {_one_of("kind", "can", "serial")}) STRICT""",
-        # captures: how many; bytes: their payload before compression; chunk: see captures.py.
+        # captures: number of captures; bytes: their payload before compression; chunk: see captures.py.
         f"""CREATE TABLE raw_chunks (id INTEGER PRIMARY KEY, link_id INTEGER NOT NULL REFERENCES links(id),
             {_instant("first_")}, {_instant("last_")}, captures INTEGER NOT NULL, bytes INTEGER NOT NULL,
             chunk BLOB NOT NULL) STRICT""",
         "CREATE INDEX raw_chunks_by_time ON raw_chunks(link_id, first_utc_ns)",
-        # Chunks whose records are not stored yet. A table of its own, because to change a flag beside a blob is to
+        # Chunks whose records are not stored yet. A separate table, because changing a flag in a row with a blob would
         # write the blob again.
         "CREATE TABLE undecoded_chunks (chunk_id INTEGER PRIMARY KEY REFERENCES raw_chunks(id)) STRICT",
     )
@@ -58,12 +58,12 @@ def m001_runs_and_raw_captures(db: Database) -> None:
 
 @MIGRATIONS()
 def m002_records(db: Database) -> None:
-    """The records that decoders make of captures."""
+    """The records that are decoded from captures."""
     sample = f"""(id INTEGER PRIMARY KEY, channel_id INTEGER NOT NULL REFERENCES channels(id), {_instant()},
         value REAL, status TEXT NOT NULL, raw_counts INTEGER, CHECK ((status = 'ok') = (value IS NOT NULL))) STRICT"""
     _create(
         db,
-        # A channel that changes its unit is another channel: stored values keep the unit that they were stored in.
+        # A channel whose unit changes becomes a new channel, so that stored values keep their unit.
         f"""CREATE TABLE channels (id INTEGER PRIMARY KEY, name TEXT NOT NULL, unit TEXT NOT NULL,
             {_one_of("kind", "joint", "signal")}, UNIQUE (name, unit, kind)) STRICT""",
         f"CREATE TABLE joint_samples {sample}",
@@ -80,12 +80,12 @@ def m002_records(db: Database) -> None:
         f"""CREATE TABLE device_events (id INTEGER PRIMARY KEY, device TEXT NOT NULL, {_instant()}, kind TEXT NOT NULL,
             text TEXT NOT NULL, code INTEGER) STRICT""",
         "CREATE INDEX device_events_by_time ON device_events(utc_ns)",
-        # count: how many like it in a row, the first of them at this instant; excerpt: the first's first bytes (all
-        # of them are in raw_chunks).
+        # count: number of equal failures in a row, the first of them at this instant; excerpt: first bytes of the first
+        # failure (raw_chunks contains all bytes).
         f"""CREATE TABLE decode_failures (id INTEGER PRIMARY KEY, device TEXT NOT NULL, {_instant()},
             reason TEXT NOT NULL, excerpt BLOB NOT NULL, count INTEGER NOT NULL) STRICT""",
         "CREATE INDEX decode_failures_by_time ON decode_failures(utc_ns)",
-        # end_ is NULL while the gap lasts. The channel `daemon` stands for everything: rigcal itself was not there.
+        # end_ is NULL while the gap lasts. The channel `daemon` stands for all channels: rigcal itself was not running.
         f"""CREATE TABLE gaps (id INTEGER PRIMARY KEY, channel TEXT NOT NULL, reason TEXT NOT NULL,
             {_instant("start_")}, {_instant("end_", optional=True)}, missed INTEGER,
             UNIQUE (channel, reason, start_boot_id, start_monotonic_ns)) STRICT""",
@@ -96,7 +96,7 @@ def m002_records(db: Database) -> None:
 
 @MIGRATIONS()
 def m003_sessions(db: Database) -> None:
-    """Station set-ups, calibration sessions and the observations that they gather."""
+    """Station set-ups, calibration sessions and their observations."""
     _create(
         db,
         # prism_constants_json: {prism: mm}.
@@ -120,8 +120,8 @@ def m003_sessions(db: Database) -> None:
             fix_ids_json TEXT NOT NULL CHECK (json_valid(fix_ids_json)), misclosure_mm REAL,
             FOREIGN KEY (setup_id, name) REFERENCES control_points(setup_id, name)) STRICT""",
         "CREATE INDEX control_shots_by_session ON control_shots(session_id)",
-        # utc_ns ..: the instant that the fix was measured, link delay taken off. values_json: the numeric columns of
-        # the observations CSV that the row has. excluded: why calibration must not use it, NULL when it may.
+        # utc_ns ..: instant at which the fix was measured, without the link delay. values_json: the row's numeric
+        # columns of the observations CSV. excluded: why calibration must not use it, NULL if it may.
         f"""CREATE TABLE observations (id INTEGER PRIMARY KEY,
             session_id TEXT NOT NULL REFERENCES calibration_sessions(id), fix_id INTEGER REFERENCES fixes(id),
             setup_id TEXT REFERENCES station_setups(id), prism TEXT NOT NULL, pose TEXT, {_instant()},
@@ -134,7 +134,7 @@ def m003_sessions(db: Database) -> None:
 
 @MIGRATIONS()
 def m004_jobs_and_models(db: Database) -> None:
-    """Work that sessions cause, and the models that come of it."""
+    """Jobs caused by sessions, and the resulting models."""
     _create(
         db,
         f"""CREATE TABLE jobs (id INTEGER PRIMARY KEY, kind TEXT NOT NULL,
@@ -157,10 +157,10 @@ def m004_jobs_and_models(db: Database) -> None:
 
 @MIGRATIONS()
 def m005_jobs_cover_sessions(db: Database) -> None:
-    """Which sessions a job works on, by their order: times of different boots cannot be compared."""
+    """Sessions that a job works on, by their order, because times of different boots cannot be compared."""
     _create(
         db,
-        # The newest session that was closed when the job was queued: it works on that one and on all before it.
+        # The newest session that was closed when the job was queued; the job works on it and on all earlier ones.
         "ALTER TABLE jobs ADD COLUMN through_session_id TEXT REFERENCES calibration_sessions(id)",
         "UPDATE jobs SET through_session_id = session_id",
         "CREATE INDEX jobs_by_coverage ON jobs(through_session_id, kind)",
@@ -170,12 +170,12 @@ def m005_jobs_cover_sessions(db: Database) -> None:
 
 @MIGRATIONS()
 def m006_models_go_live(db: Database) -> None:
-    """Who put which model live, and when; a comparison that an operator asks for names its model."""
+    """Who made which model live, and when; a comparison requested by an operator names its model."""
     _create(
         db,
-        # Every change of a model's state. replaced_id: the model that was live before one that went live.
-        # zeros_checked_through: no change, but an operator's word that the joints' zeros are those of the model's
-        # training, whatever jumped up to that device event. NULL in a change.
+        # Every change of a model's state. replaced_id: the model that was live before the one that went live.
+        # zeros_checked_through: not a change; an operator confirms that the joints' zeros are those of the model's
+        # training, despite all jumps up to that device event. NULL in a change.
         f"""CREATE TABLE model_states (id INTEGER PRIMARY KEY, model_id INTEGER NOT NULL REFERENCES models(id),
             {_one_of("state", "candidate", "live", "retired")}, {_instant()}, operator TEXT NOT NULL DEFAULT '',
             reason TEXT NOT NULL, replaced_id INTEGER REFERENCES models(id),
@@ -190,21 +190,21 @@ def m006_models_go_live(db: Database) -> None:
 
 @MIGRATIONS()
 def m007_checks_show_drift(db: Database) -> None:
-    """Every check session held against the live model, and how its sums of errors stand after it."""
+    """Comparisons of check sessions with the live model, and the cumulative sums of errors after each."""
     _create(
         db,
-        # Number of the rig's newest session when a model went live: checks after it count. NULL in other changes, and
-        # in those from before this migration.
+        # Number of the rig's newest session when a model went live: later checks are counted. NULL in other changes,
+        # and in changes from before this migration.
         "ALTER TABLE model_states ADD COLUMN after_session INTEGER",
-        # live_since: the change by which the model went live; with each new one the sums begin anew. ratio: RMS of the
-        # errors over their predicted sigma, NULL where the session could not be used, as reason says. upper, lower: as
-        # calibration.numerics.statistics has them.
+        # live_since: the change by which the model went live; each such change resets the sums. ratio: RMS of the
+        # errors over their predicted sigma, NULL if the session could not be used; reason states why. upper, lower: as
+        # in calibration.numerics.statistics.
         f"""CREATE TABLE drift_checks (id INTEGER PRIMARY KEY, live_since INTEGER NOT NULL REFERENCES model_states(id),
             session_id TEXT NOT NULL REFERENCES calibration_sessions(id), {_instant()}, fixes INTEGER NOT NULL,
             standstills INTEGER NOT NULL, ratio REAL, reason TEXT NOT NULL DEFAULT '', upper REAL NOT NULL,
             lower REAL NOT NULL, {_one_of("alarm", "none", "worse", "better")},
             UNIQUE (live_since, session_id)) STRICT""",
-        # Identification is part of the gap workflow now; what has not run yet, or may be retried, runs as that.
+        # Identification is now part of the gap workflow; jobs that have not run yet, or may be retried, run as that.
         "UPDATE jobs SET kind = 'gap' WHERE kind = 'identification'",
     )
 
@@ -214,8 +214,8 @@ def m008_one_open_session(db: Database) -> None:
     """At most one session of a rig is open."""
     _create(
         db,
-        # Two were left open where a session was started after the end of another could not be stored. The newest goes
-        # on; fixes of the newer ones may be stored as observations of the others.
+        # Several were left open if a session was started after the end of another could not be stored. The newest stays
+        # open; fixes of newer sessions may be stored as observations of the others.
         """UPDATE calibration_sessions AS old SET state = 'aborted',
             note = ltrim(old.note || '; ', '; ') || 'aborted by rigcal: it was still open when session ' || newest.id
                 || ' was started, and may hold fixes of that one',
@@ -233,10 +233,10 @@ def m009_uncontrolled_sessions(db: Database) -> None:
     """Sessions that calibration must not use, until an operator accepts them."""
     _create(
         db,
-        # As of an observation: why calibration must not use it, NULL when it may. Decided when it is closed.
+        # As for an observation: why calibration must not use it, NULL if it may. Decided when the session is closed.
         "ALTER TABLE calibration_sessions ADD COLUMN excluded TEXT",
-        # An operator's word that it may be used, despite what `excluded` said; after_job: number of the newest job
-        # then, which did not know of it.
+        # An operator has accepted the session despite the reason in `excluded`; after_job: number of the newest job at
+        # that time, which did not use the session.
         "ALTER TABLE calibration_sessions ADD COLUMN accepted_despite TEXT",
         "ALTER TABLE calibration_sessions ADD COLUMN accepted_by TEXT NOT NULL DEFAULT ''",
         "ALTER TABLE calibration_sessions ADD COLUMN accepted_utc_ns INTEGER",
@@ -247,7 +247,7 @@ def m009_uncontrolled_sessions(db: Database) -> None:
         "CREATE INDEX calibration_sessions_used ON calibration_sessions(rig, state, kind) WHERE excluded IS NULL",
         """CREATE INDEX calibration_sessions_accepted ON calibration_sessions(rig, kind, accepted_after_job)
             WHERE accepted_after_job IS NOT NULL""",
-        # All that a session's summary asks of its observations, in the order that they were measured in.
+        # All columns that a session's summary needs of its observations, in order of measurement.
         "DROP INDEX observations_by_session",
         """CREATE INDEX observations_by_session
             ON observations(session_id, boot_id, monotonic_ns, utc_ns, excluded, pose)""",
@@ -256,11 +256,11 @@ def m009_uncontrolled_sessions(db: Database) -> None:
 
 @MIGRATIONS()
 def m010_prism_confirmations(db: Database) -> None:
-    """Words that a session's stations are on its prism: fixes that looked like another one's count from then on."""
+    """Confirmations that a session's stations are on its prism: suspected fixes are used from then on."""
     _create(
         db,
-        # turning: nobody said so, but something turned the station to the prism; it may have measured what it was on
-        # before for a while.
+        # turning: not confirmed by an operator; a program turned the station to the prism, and the station may have
+        # measured its earlier target for a while.
         f"""CREATE TABLE prism_confirmations (id INTEGER PRIMARY KEY,
             session_id TEXT NOT NULL REFERENCES calibration_sessions(id), {_instant()},
             operator TEXT NOT NULL DEFAULT '', turning INTEGER NOT NULL CHECK (turning IN (0, 1))) STRICT""",
@@ -270,14 +270,14 @@ def m010_prism_confirmations(db: Database) -> None:
 
 @MIGRATIONS()
 def m011_store_health(db: Database) -> None:
-    """Checks of the store itself, and what the end of the computer did to jobs."""
+    """Checks of the store itself, and interruptions of jobs by a shutdown of the computer."""
     _create(
         db,
-        # result: `ok`, or what is damaged; NULL while a check runs, and where it never came to its end.
+        # result: `ok`, or a description of the damage; NULL while a check runs, and if it did not finish.
         f"""CREATE TABLE store_checks (id INTEGER PRIMARY KEY, {_instant("started_")},
             {_instant("ended_", optional=True)}, result TEXT) STRICT""",
-        # host_boot: the kernel's boot in which the job was started, whatever the rig's clock says (a simulated one has
-        # boots of its own). interruptions: how often something interrupted it that was none of its attempts.
+        # host_boot: the kernel's boot in which the job was started, independent of the rig's clock (a simulated clock
+        # has its own boots). interruptions: number of interruptions that do not count as attempts.
         "ALTER TABLE jobs ADD COLUMN host_boot TEXT",
         "ALTER TABLE jobs ADD COLUMN interruptions INTEGER NOT NULL DEFAULT 0",
     )
@@ -285,7 +285,7 @@ def m011_store_health(db: Database) -> None:
 
 @MIGRATIONS()
 def m012_comparisons_know_the_live_model(db: Database) -> None:
-    """A comparison of a named model says with which change the model beside it had gone live."""
+    """A comparison of a named model refers to the change by which the other model had gone live."""
     _create(
         db,
         "ALTER TABLE jobs ADD COLUMN live_since INTEGER REFERENCES model_states(id)",
@@ -298,7 +298,7 @@ def m013_alarms(db: Database) -> None:
     """Alarms: faults, since when, and what to do about them."""
     _create(
         db,
-        # raised_: when it was noticed; cleared_ is NULL while it is active.
+        # raised_: when the alarm was raised; cleared_ is NULL while it is active.
         f"""CREATE TABLE alarms (id INTEGER PRIMARY KEY, kind TEXT NOT NULL, subject TEXT NOT NULL,
             {_one_of("severity", "warning", "critical")}, text TEXT NOT NULL, remedy TEXT NOT NULL,
             {_instant("raised_")}, {_instant("cleared_", optional=True)}) STRICT""",
@@ -308,11 +308,11 @@ def m013_alarms(db: Database) -> None:
 
 @MIGRATIONS()
 def m014_who_said_so(db: Database) -> None:
-    """Which user's process gave a command, as the kernel tells, beside the operator that it names."""
+    """The user whose process gave a command, as reported by the kernel, in addition to the operator it names."""
     _create(
         db,
-        # NULL where no command caused the row, and in rows from before this migration. caller_user: "" where the
-        # computer knew no name for caller_uid.
+        # NULL if no command caused the row, and in rows from before this migration. caller_user: "" if the computer had
+        # no name for caller_uid.
         *(
             f"ALTER TABLE {table} ADD COLUMN {prefix}{column}"
             for table, prefix in (
@@ -328,17 +328,17 @@ def m014_who_said_so(db: Database) -> None:
 
 @MIGRATIONS()
 def m015_large_chunks(db: Database) -> None:
-    """Captures are found by their time, and small chunks that large ones may be made of are known."""
+    """An index of captures by time, and a list of the small chunks that can be packed into large ones."""
     _create(
         db,
-        # Chunks as acquisition has committed them. A table of its own, for the reason that undecoded_chunks is one.
+        # Chunks as committed by acquisition. A separate table for the same reason as undecoded_chunks.
         "CREATE TABLE small_chunks (chunk_id INTEGER PRIMARY KEY REFERENCES raw_chunks(id)) STRICT",
         "INSERT INTO small_chunks SELECT id FROM raw_chunks",
-        # All that the query of a time asks before it reads a chunk.
+        # All columns that a query by time needs before it reads a chunk.
         "DROP INDEX raw_chunks_by_time",
         """CREATE INDEX raw_chunks_by_end
             ON raw_chunks(last_boot_id, last_monotonic_ns, first_boot_id, first_monotonic_ns, link_id)""",
-        # One index for what is asked by time: which rows may be deleted, and which decoding again replaces.
+        # One index for queries by time: rows that may be deleted, and rows that are replaced by decoding again.
         "DROP INDEX joint_samples_by_time",
         "DROP INDEX signals_by_time",
         "DROP INDEX decode_failures_by_time",
@@ -346,7 +346,7 @@ def m015_large_chunks(db: Database) -> None:
             f"CREATE INDEX {table}_by_instant ON {table}(boot_id, monotonic_ns)"
             for table in ("joint_samples", "signals", "decode_failures")
         ),
-        # A fix that is deleted is looked for among the observations: a foreign key.
+        # Deleting a fix searches the observations, because of the foreign key.
         "CREATE INDEX observations_by_fix ON observations(fix_id) WHERE fix_id IS NOT NULL",
         "DROP INDEX fixes_by_time",  # no query uses these
         "DROP INDEX device_events_by_time",
@@ -356,11 +356,11 @@ def m015_large_chunks(db: Database) -> None:
 
 @MIGRATIONS()
 def m020_notices(db: Database) -> None:
-    """Notices of alarms to people elsewhere: those told, and those still to be told."""
+    """Notices of alarms to people elsewhere: sent and pending ones."""
     _create(
         db,
-        # target: way out of the machine. utc_ns ..: when the alarm was raised or cleared, or a test asked for; raised_:
-        # when it was raised. sent_ is NULL until the target was told, alone or in a sum.
+        # target: webhook or command. utc_ns ..: when the alarm was raised or cleared, or a test was requested; raised_:
+        # when it was raised. sent_ is NULL until the notice is delivered, by itself or in a summary.
         f"""CREATE TABLE notices (id INTEGER PRIMARY KEY, target TEXT NOT NULL,
             {_one_of("event", "raised", "cleared", "test")}, kind TEXT NOT NULL, subject TEXT NOT NULL,
             {_one_of("severity", "warning", "critical")}, text TEXT NOT NULL, remedy TEXT NOT NULL,
@@ -373,18 +373,18 @@ def m020_notices(db: Database) -> None:
 
 @MIGRATIONS()
 def m024_guides(db: Database) -> None:
-    """Guided sessions: what each guide was asked for, and all that has happened in it, from which its state follows."""
+    """Guided sessions: the request of each guide, and all its events, from which its state is derived."""
     caller = "caller_user TEXT, caller_uid INTEGER, caller_pid INTEGER"
     _create(
         db,
-        # taps: number of commands that were given to it.
+        # taps: number of commands given to the guide.
         f"""CREATE TABLE guides (id INTEGER PRIMARY KEY, rig TEXT NOT NULL,
             {_one_of("state", "open", "finished", "abandoned")},
             setup_id TEXT NOT NULL REFERENCES station_setups(id),
             operator TEXT NOT NULL, request_json TEXT NOT NULL, taps INTEGER NOT NULL, {_instant("started_")},
             {_instant("ended_", optional=True)}, {caller}) STRICT""",
         "CREATE UNIQUE INDEX guides_one_open ON guides(rig) WHERE state = 'open'",
-        # kind, details_json: see daemon/guide/job.py. caller_: NULL where the guide went on by itself.
+        # kind, details_json: see daemon/guide/job.py. caller_: NULL if the guide continued by itself.
         f"""CREATE TABLE guide_events (id INTEGER PRIMARY KEY, guide_id INTEGER NOT NULL REFERENCES guides(id),
             kind TEXT NOT NULL, details_json TEXT NOT NULL, {_instant()}, {caller}) STRICT""",
         "CREATE INDEX guide_events_by_guide ON guide_events(guide_id)",
@@ -393,10 +393,10 @@ def m024_guides(db: Database) -> None:
 
 @MIGRATIONS()
 def m028_session_clocks(db: Database) -> None:
-    """State of the computer's clock when a session began and ended, as its time service told."""
+    """State of the computer's clock at a session's start and end, as reported by its time service."""
     _create(
         db,
-        # synchronized: NULL where nothing told. offset_s: by how much the clock was ahead; NULL where nothing told.
+        # synchronized: NULL if unknown. offset_s: by how much the clock was ahead; NULL if unknown.
         f"""CREATE TABLE session_clocks (session_id TEXT NOT NULL REFERENCES calibration_sessions(id),
             {_one_of("phase", "start", "end")}, synchronized INTEGER CHECK (synchronized IN (0, 1)), offset_s REAL,
             max_error_s REAL, source TEXT NOT NULL, error TEXT NOT NULL,
@@ -406,15 +406,15 @@ def m028_session_clocks(db: Database) -> None:
 
 @MIGRATIONS()
 def m030_rig_files(db: Database) -> None:
-    """Every rig file is stored once, by its hash; sessions and models refer to it."""
+    """Every rig file is stored once, under its hash; sessions and models refer to it."""
     _create(
         db,
         """CREATE TABLE rig_files (sha256 TEXT PRIMARY KEY NOT NULL, rig TEXT NOT NULL, text TEXT NOT NULL) STRICT""",
         "ALTER TABLE calibration_sessions ADD COLUMN rig_file TEXT REFERENCES rig_files(sha256)",
-        # Of the newest session that the model was trained on; NULL where its job's result does not name any.
+        # Rig file of the newest session that the model was trained on; NULL if its job's result names no session.
         "ALTER TABLE models ADD COLUMN rig_sha256 TEXT REFERENCES rig_files(sha256)",
     )
-    # By what is stored, not by the hash beside it, which was never checked.
+    # Computed from the stored text, because the stored hash was never checked.
     for rig, text in db.execute("SELECT rig, rig_text FROM calibration_sessions GROUP BY rig_text").fetchall():
         sha256 = hashlib.sha256(text.encode()).hexdigest()
         db.execute("INSERT INTO rig_files (sha256, rig, text) VALUES (?, ?, ?)", [sha256, rig, text])
@@ -433,12 +433,12 @@ def m030_rig_files(db: Database) -> None:
 
 @MIGRATIONS()
 def m031_states_of_devices(db: Database) -> None:
-    """The last event of a device is looked for by every start."""
+    """An index for the last event of each device, which is read at every start."""
     db.execute("CREATE INDEX device_events_of_states ON device_events(device, kind, boot_id, monotonic_ns)")
 
 
 def unknown_migrations(db: Database) -> list[str]:
-    """Migrations that `db` has and this program does not know: it was made by a newer one."""
+    """Return the migrations in `db` that this program does not know; then a newer program made it."""
     empty = Database(memory=True)
     known = {migration.name for migration in MIGRATIONS.pending(empty)}
     empty.close()
@@ -446,5 +446,5 @@ def unknown_migrations(db: Database) -> list[str]:
 
 
 def pending_migrations(db: Database) -> list[str]:
-    """Migrations that `db` does not have yet: it was made by an older program."""
+    """Return the migrations that `db` does not have yet; then an older program made it."""
     return [migration.name for migration in MIGRATIONS.pending(db)]

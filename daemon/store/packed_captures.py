@@ -1,19 +1,20 @@
-"""The body of a large chunk: what neighbours share is taken out, so that little but noise is left to compress.
+"""The body of a large chunk: redundancy between neighbouring captures is removed before compression.
 
-A *stream* is what has one identifier, one set of flags and one length: one kind of message. The body is, little endian,
-each column of integers byte plane by byte plane:
+A *stream* is the set of captures with one identifier, one set of flags and one length: one kind of message. The body
+is, little endian, each column of integers byte plane by byte plane:
 
     streams: count u32, identifier u32 each, flags u8 each, length u32 each (serial: 0, any length)
-    order: code u32 per capture: 0, the stream that last followed the stream before it; else 1 + number of the stream
-    times, stream after stream: u64, zigzag of monotonic_ns less that of the capture before, less the usual such
-        difference of the stream (u64 zigzag per stream, before them)
-    clock: u64 per capture, zigzag of the change of utc_ns - monotonic_ns since the capture before
+    order: code u32 per capture: 0 for the stream that last followed the previous capture's stream, otherwise 1 + number
+        of the stream
+    times, stream by stream: u64, zigzag of the difference of monotonic_ns from the previous capture, minus the usual
+        difference of the stream (u64 zigzag per stream, stored before them)
+    clock: u64 per capture, zigzag of the change of utc_ns - monotonic_ns since the previous capture
     serial only: length u32 per capture
-    data, stream after stream: form u8 per stream, then its bytes in that form
+    data, stream by stream: form u8 per stream, then its bytes in that form
 
-Forms of data, of which each stream has the one of least entropy: 0, the bytes of each place; 1, their changes; 2 and 4,
-the changes of little-endian words of so many bytes, zigzag, with the changes of bytes that no word is left for. Serial
-data are their bytes, one capture after the other.
+Each stream has its data in the form of least entropy: 0, the bytes of each position; 1, their changes; 2 and 4, the
+changes of little-endian words of 2 or 4 bytes, zigzag, and the changes of remaining bytes. Serial data are stored as
+bytes, one capture after the other.
 """
 
 from __future__ import annotations
@@ -67,7 +68,12 @@ def joined(parts: Sequence[CaptureColumns]) -> CaptureColumns:
 
 
 def packed(columns: CaptureColumns, *, is_serial: bool) -> bytes:
-    """Return the body for captures, one at least."""
+    """Return the body for captures.
+
+    Args:
+        columns: the captures, at least one.
+        is_serial: whether their link is serial.
+    """
     own_length = np.zeros_like(columns.length) if is_serial else columns.length
     key = np.stack([columns.identifier.astype(np.int64), columns.flags, own_length], axis=1)
     streams, number = np.unique(key, axis=0, return_inverse=True)
@@ -102,13 +108,18 @@ def packed(columns: CaptureColumns, *, is_serial: bool) -> bytes:
 def unpacked(body: bytes, count: int, *, is_serial: bool) -> CaptureColumns:
     """Return the captures of a body.
 
+    Args:
+        body: the body.
+        count: number of captures in it.
+        is_serial: whether their link is serial.
+
     Raises:
-        ValueError, IndexError: the body makes no sense.
+        ValueError, IndexError: the body is invalid.
     """
     source = Planes(body)
     (streams,) = _COUNT.unpack(source.take(_COUNT.size))
     if not 0 < streams <= count:
-        raise ValueError(f"{streams} streams of {count} captures")
+        raise ValueError(f"{streams} streams in {count} captures")
     identifier = source.column("<u4", streams).astype(np.uint32)
     flags = source.column("u1", streams).astype(np.uint8)
     width = source.column("<u4", streams).astype(np.uint32)
@@ -137,7 +148,7 @@ def unpacked(body: bytes, count: int, *, is_serial: bool) -> CaptureColumns:
 
 
 def _begins(length: NDArray[np.uint32]) -> NDArray[np.int64]:
-    """Return where in the payload each capture's data begin."""
+    """Return the position in the payload at which each capture's data begin."""
     ends = np.cumsum(length, dtype=np.int64)
     begins: NDArray[np.int64] = ends - length
     return begins
@@ -150,7 +161,7 @@ def _middle(values: NDArray[np.int64]) -> np.int64:
 
 
 def _order_codes(number: Integers) -> Integers:
-    """Return for each capture 0 where its stream is the one that last followed the stream before it, else 1 + it."""
+    """Return, per capture, 0 if its stream last followed the previous capture's stream, else 1 + stream number."""
     before = np.concatenate([[-1], number[:-1]])
     by_before = np.argsort(before, kind="stable")
     follows = number[by_before]
@@ -160,7 +171,7 @@ def _order_codes(number: Integers) -> Integers:
 
 
 def _stream_numbers(codes: Integers, streams: int) -> Integers:
-    """Return the streams that `_order_codes` made codes of; ValueError where they make no sense."""
+    """Return the stream numbers encoded by `_order_codes`; raise ValueError for an invalid code."""
     follower: dict[int, int] = {}
     found, before = [], -1
     for code in codes.tolist():
@@ -173,7 +184,7 @@ def _stream_numbers(codes: Integers, streams: int) -> Integers:
 
 
 def _least(rows: NDArray[np.uint8]) -> tuple[int, bytes]:
-    """Return the form of least entropy of a stream's data (n, width), and the data in it."""
+    """Return the form of least entropy for a stream's data (n, width), and the data in this form."""
     width = rows.shape[1]
     forms = {_BYTES: rows, _CHANGES: _changes(rows)}
     forms |= {word: _word_changes(rows, word) for word in _WORDS if width >= word}
@@ -182,14 +193,14 @@ def _least(rows: NDArray[np.uint8]) -> tuple[int, bytes]:
 
 
 def _restored(body: bytes, form: int, count: int, width: int) -> NDArray[np.uint8]:
-    """Return the data (n, width) from a form; ValueError for one that does not exist."""
+    """Return the data (n, width) from their form; raise ValueError for an unknown form."""
     columns = np.frombuffer(body, dtype=np.uint8).reshape(width, count).T
     if form == _BYTES:
         return np.ascontiguousarray(columns)
     if form == _CHANGES:
         return np.cumsum(columns, axis=0, dtype=np.uint8)
     if form not in _WORDS:
-        raise ValueError(f"data have the form {form}")
+        raise ValueError(f"data have the unknown form {form}")
     whole = width // form * form
     unsigned = np.dtype(f"<u{form}")
     zigzag = np.ascontiguousarray(columns[:, :whole]).view(unsigned)
@@ -213,7 +224,7 @@ def _word_changes(rows: NDArray[np.uint8], word: int) -> NDArray[np.uint8]:
 
 
 def _entropy_bits(rows: NDArray[np.uint8]) -> float:
-    """Return the entropy of the bytes of each column by itself, in bits, summed."""
+    """Return the sum over columns of the entropy of each column's bytes, in bits."""
     bits = 0.0
     for column in rows.T:
         count = np.bincount(column, minlength=_VALUES)
@@ -232,37 +243,37 @@ def _signed(zigzag: Integers) -> NDArray[np.int64]:
 
 
 def planes(column: Integers) -> bytes:
-    """Return a column byte plane by byte plane, first all lowest bytes: neighbours resemble each other."""
+    """Return a column byte plane by byte plane, lowest bytes first, because neighbouring bytes are then similar."""
     size = column.dtype.itemsize
     little = np.ascontiguousarray(column.astype(column.dtype.newbyteorder("<"), copy=False))
     return np.ascontiguousarray(little.view(np.uint8).reshape(-1, size).T).tobytes()
 
 
 class Planes:
-    """Reads a body from its beginning to its end.
+    """Reads a body sequentially.
 
     Args:
-        body: bytes, and columns as `planes` has them.
+        body: the body, with columns as encoded by `planes`.
     """
 
     def __init__(self, body: bytes) -> None:
         self._body, self._at = body, 0
 
     def take(self, size: int) -> bytes:
-        """Return the next bytes; ValueError where there are fewer."""
+        """Return the next `size` bytes; raise ValueError if there are fewer."""
         if self._at + size > len(self._body):
             raise ValueError("it ends too early")
         self._at += size
         return self._body[self._at - size : self._at]
 
     def column(self, dtype: str, count: int) -> Integers:
-        """Return the next column; ValueError where the body ends before it."""
+        """Return the next column; raise ValueError if the body ends before it."""
         size = np.dtype(dtype).itemsize
         planes = np.frombuffer(self.take(size * count), dtype=np.uint8)
         column: Integers = np.ascontiguousarray(planes.reshape(size, -1).T).view(dtype)[:, 0]
         return column
 
     def end(self) -> None:
-        """ValueError where there is more."""
+        """Raise ValueError if there are more bytes."""
         if self._at != len(self._body):
             raise ValueError(f"{len(self._body) - self._at} bytes too many")

@@ -1,9 +1,9 @@
-"""Conditions on places, (boot, monotonic time), that an index serves whole where a place is of another table's row.
+"""SQL conditions on places, (boot, monotonic time), that can use an index fully when a place comes from another table.
 
-SQLite searches an index by both columns for `(boot_id, monotonic_ns) >= (?, ?)`, but by the first alone, and reads the
-whole boot, where columns of another table stand on the right. So such queries go boot by boot, in the order of time:
-`FROM ... CROSS JOIN boots CROSS JOIN table AS row WHERE` these conditions. The plus keeps the planner from searching
-the rows by a range of boots instead.
+For `(boot_id, monotonic_ns) >= (?, ?)` SQLite searches an index by both columns. If the right side consists of columns
+of another table, it searches by the first column only and reads the whole boot. Such queries therefore go boot by boot,
+in order of time: `FROM ... CROSS JOIN boots CROSS JOIN table AS row WHERE` these conditions. The unary plus keeps the
+planner from searching the rows by a range of boots instead.
 """
 
 from __future__ import annotations
@@ -11,15 +11,15 @@ from __future__ import annotations
 LEAST_NS, MOST_NS = -(2**63), 2**63 - 1
 
 Sql = tuple[str, str]
-"""A place in SQL: its boot and its monotonic time."""
+"""SQL expressions of a place: its boot and its monotonic time."""
 
 
 def since(row: str, place: Sql) -> str:
-    """Return the condition that a row is of the place or later.
+    """Return the condition that a row is at the place or later.
 
     Args:
-        row: its alias with what its columns begin with, `chunk.last_`.
-        place: columns of a table that stands before, or parameters.
+        row: alias of the row with the prefix of its columns, such as `chunk.last_`.
+        place: columns of a table earlier in the FROM clause, or parameters.
     """
     boot, at_ns = place
     return (
@@ -29,7 +29,13 @@ def since(row: str, place: Sql) -> str:
 
 
 def between(row: str, first: Sql, last: Sql) -> str:
-    """Return the condition that a row is of the first place, of the last one, or between them."""
+    """Return the condition that a row is between two places, both included.
+
+    Args:
+        row: alias of the row with the prefix of its columns.
+        first: the first place, as for `since`.
+        last: the last place, likewise.
+    """
     boot, at_ns = last
     until = f"+boots.id <= {boot} AND {row}monotonic_ns <= iif(boots.id = {boot}, {at_ns}, {MOST_NS})"
     return f"{since(row, first)}\n    AND {until}"

@@ -1,4 +1,4 @@
-"""Read-only connections: as many as wanted, in any process, while the daemon writes."""
+"""Read-only connections: any number of them, in any process, while the daemon writes."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from daemon.store.rows import sql_value, stamp_of, stored_text
 from drivers.clock import Stamp
 from drivers.readings import Capture
 
-# By the index alone, then chunk by chunk in their order: neither all chunks are read, nor any sorted. One statement, so
-# that chunks which are packed meanwhile are read as they were.
+# Ids are found by the index alone and chunks read in order of id, so that not all chunks are read and none are sorted.
+# A single statement, so that chunks that are packed meanwhile are read as they were.
 CHUNKS = """SELECT id, chunk FROM raw_chunks WHERE id IN (SELECT id FROM raw_chunks
         WHERE (last_boot_id, last_monotonic_ns) >= (?1, ?2) AND (first_boot_id, first_monotonic_ns) <= (?3, ?4)
             AND (?5 IS NULL OR link_id = (SELECT id FROM links WHERE name = ?5)))
@@ -38,14 +38,14 @@ _RECORDS = {
 
 
 class Reader:
-    """A read-only view of a store; a context manager. Belongs to the thread that opened it.
+    """A read-only view of a store; a context manager. For the thread that opened it only.
 
     Args:
         path: the database.
-        identity: which file it must be; any when None.
+        identity: identity that the file must have; None for any.
 
     Raises:
-        StoreError: there is no store at `path`, or it is another one.
+        StoreError: there is no store at `path`, or the file is a different one.
     """
 
     def __init__(self, path: Path, identity: FileIdentity | None = None) -> None:
@@ -53,11 +53,11 @@ class Reader:
         self._boots: dict[int, str] = {}
         if identity is not None and FileIdentity.of(path) != identity:
             raise StoreError(
-                f"{path}: this is not the store that the daemon writes to: the file was replaced or removed while it "
-                "ran; `rigcal status` says what to do"
+                f"{path}: this is not the store that the daemon writes to: the file was replaced or removed while the "
+                "daemon ran; `rigcal status` shows what to do"
             )
         if not path.is_file():
-            raise StoreError(f"{path}: there is no store; the daemon makes one when it starts")
+            raise StoreError(f"{path}: there is no store; the daemon creates one when it starts")
         # Never immutable=1: the file changes under a live daemon.
         self._connection = sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)
         self._connection.row_factory = sqlite3.Row
@@ -83,7 +83,7 @@ class Reader:
 
     @contextlib.contextmanager
     def snapshot(self) -> Iterator[None]:
-        """Let all queries of a block see the store as it was at the first of them."""
+        """Let all queries in a block see the store as it was at the first query."""
         self._connection.execute("BEGIN")
         try:
             yield
@@ -91,22 +91,26 @@ class Reader:
             self._connection.rollback()
 
     def interrupt_by(self, look: Callable[[], None]) -> None:
-        """Let `look`, which long queries call again and again, end them by what it raises: with SQLITE_INTERRUPT."""
+        """Make long queries call `look` repeatedly, and end them with SQLITE_INTERRUPT if it raises."""
 
         def is_over() -> int:
             try:
                 look()
-            except Exception:  # noqa: BLE001 - the caller asks again, and gets what is raised itself
+            except Exception:  # noqa: BLE001 - the caller calls `look` itself again, and gets its exception
                 return 1
             return 0
 
         self._connection.set_progress_handler(is_over, 100_000)
 
     def rows(self, sql: str, parameters: Sequence[object] = ()) -> Iterator[dict[str, Any]]:
-        """Rows of a query as mappings, one at a time.
+        """Yield the rows of a query as mappings, one at a time.
+
+        Args:
+            sql: the query.
+            parameters: values of its placeholders.
 
         Raises:
-            StoreError: an older rigcal has made the store, and what is asked for is not in it.
+            StoreError: the store was made by an older rigcal, and lacks a table or column of the query.
             sqlite3.Error: the query is wrong, or would write.
         """
         try:
@@ -114,29 +118,29 @@ class Reader:
         except sqlite3.OperationalError as error:
             if str(error).startswith("no such") and pending_migrations(Database(self._connection)):
                 raise StoreError(
-                    f"{self.path}: made by an older rigcal; the daemon of this version updates it at its start"
+                    f"{self.path}: made by an older rigcal; the daemon of this version updates it when it starts"
                 ) from error
             raise
         for row in cursor:
             yield dict(row)
 
     def boots(self) -> dict[int, str]:
-        """Kernel boot ids by row id, for `rows.stamp_of`."""
+        """Return kernel boot ids by row id, for `rows.stamp_of`."""
         return {row["id"]: row["kernel_boot_id"] for row in self._connection.execute("SELECT * FROM boots")}
 
     def links(self) -> list[dict[str, Any]]:
-        """Name and kind of every link that captures are stored of."""
+        """Return name and kind of every link with stored captures."""
         return list(self.rows("SELECT name, kind FROM links ORDER BY id"))
 
     def count(self, table: str) -> int:
-        """Number of rows of a table."""
+        """Return the number of rows of a table."""
         return int(next(self.rows(f'SELECT count(*) AS n FROM "{table}"'))["n"])
 
     def records(self) -> Iterator[tuple[str, dict[str, Any]]]:
-        """Yield what decoding has stored, in columns that follow from the captures alone.
+        """Yield all decoded records, with only those columns that depend on nothing but the captures.
 
         Yields:
-            table, and a row of it; each table's in the order they were stored.
+            Name of the table and a row of it; the rows of a table in the order in which they were stored.
         """
         for table, columns in _RECORDS.items():
             join = " JOIN channels ON channels.id = channel_id" if "channels.name" in columns else ""
@@ -146,13 +150,13 @@ class Reader:
     def captures(
         self, link: str | None = None, since: Stamp | None = None, until: Stamp | None = None
     ) -> Iterator[Capture]:
-        """Stored captures of one link, in the order they were stored, or of all links, in the order of their chunks.
+        """Yield the captures of one link, in the order of storing, or of all links, in the order of their chunks.
 
         Args:
-            link: name of the link; all when None.
-            since: the first instant, on the monotonic clock of its boot (the wall clock may have been set in between);
-                unbounded when None.
-            until: the last instant, likewise.
+            link: name of the link; None for all links.
+            since: first instant, on the monotonic clock of its boot (the wall clock may have been set in between); None
+                for no limit.
+            until: last instant, likewise.
 
         Raises:
             StoreError: a chunk is damaged; the message names it.
@@ -172,7 +176,7 @@ class Reader:
             yield from (c for c in captures if first <= place(c.stamp) <= last)
 
     def stamp(self, row: Mapping[str, object], prefix: str = "") -> Stamp:
-        """The instant in a row's `<prefix>utc_ns`, `<prefix>monotonic_ns`, `<prefix>boot_id`."""
+        """Return the instant in a row's `<prefix>utc_ns`, `<prefix>monotonic_ns`, `<prefix>boot_id`."""
         if row[f"{prefix}boot_id"] not in self._boots:
             self._boots = self.boots()
         return stamp_of(row, self._boots, prefix)

@@ -1,4 +1,4 @@
-"""Records as rows: what reaches a STRICT table is a Python int, float, str, bytes or None, and never NaN."""
+"""Records as rows of STRICT tables: values are a Python int, float, str, bytes or None, never NaN."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from drivers.readings import DecodeFailure, Fix, Reading, Status
 SqlValue = int | float | str | bytes | None
 SqlRow = tuple[SqlValue, ...]
 
-EXCERPT_BYTES = 64  # of a decode failure; all the bytes are in the raw chunks
+EXCERPT_BYTES = 64  # bytes stored with a decode failure; the raw chunks contain all bytes
 
 
 class RowSource(Protocol):
-    """Anything that queries may be asked of: the writing connection, or a reader."""
+    """A source of query results: the writing connection, or a reader."""
 
     def rows(self, sql: str, parameters: Sequence[object] = ()) -> Iterable[dict[str, Any]]:
-        """The rows of a query as mappings."""
+        """Return the rows of a query as mappings."""
 
 
 FIX_NUMBERS = (
@@ -45,20 +45,20 @@ FIX_COLUMNS = (
 
 
 def marks(values: Collection[object]) -> str:
-    """Return the question marks of a query that stand for values."""
+    """Return the placeholders (question marks) of a query for values."""
     return ", ".join("?" * len(values))
 
 
 def stored_text(data: bytes) -> str:
-    """Return a text column's value; bytes of another program's that are no UTF-8 become replacement characters."""
+    """Return a text column's value; bytes that are not UTF-8, from other programs, become replacement characters."""
     return data.decode("utf-8", "replace")
 
 
 def sql_value(value: object) -> SqlValue:
-    """`value` as SQLite stores it: numpy scalars become Python's, NaN and infinities None, mappings and lists JSON.
+    """Convert a value for SQLite: numpy scalars to Python's, NaN and infinities to None, mappings and lists to JSON.
 
     Raises:
-        TypeError: `value` is nothing that a column can hold.
+        TypeError: a column cannot hold `value`.
     """
     if isinstance(value, np.generic):
         value = value.item()
@@ -81,12 +81,12 @@ def _json_value(value: object) -> object:
     if isinstance(value, list | tuple | np.ndarray):
         return [_json_value(item) for item in value]
     if isinstance(value, bool | np.bool_):
-        return bool(value)  # a column has no truth values, JSON has
+        return bool(value)  # JSON has truth values, columns do not
     return sql_value(value)
 
 
 def sample_row(reading: Reading, channel_id: int, boot_id: int) -> SqlRow:
-    """A row of `joint_samples` or `signals`. A value that is no finite number is stored as none, malformed."""
+    """Return a row of `joint_samples` or `signals`; a value that is not finite is stored as NULL and malformed."""
     value, status = reading.value, reading.status
     if value is not None:
         value = float(value)
@@ -104,12 +104,18 @@ def sample_row(reading: Reading, channel_id: int, boot_id: int) -> SqlRow:
 
 
 def _signed_64(counts: int) -> int:
-    """An unsigned 64-bit integer of a device as the two's complement that SQLite can hold."""
+    """Return an unsigned 64-bit integer of a device as a signed one, which SQLite can hold."""
     return counts - 2**64 if counts >= 2**63 else counts
 
 
 def fix_row(fix: Fix, boot_id: int, last_byte_boot_id: int) -> SqlRow:
-    """A row of `fixes`, in the order of FIX_COLUMNS. A number that is not finite makes the fix malformed."""
+    """Return a row of `fixes`, in the order of FIX_COLUMNS; a number that is not finite makes the fix malformed.
+
+    Args:
+        fix: the fix.
+        boot_id: row of `boots` of its stamp.
+        last_byte_boot_id: row of `boots` of the stamp of its last byte.
+    """
     numbers = [sql_value(getattr(fix, name)) for name in FIX_NUMBERS]
     broken = [n for n, value in zip(FIX_NUMBERS, numbers, strict=True) if value is None and getattr(fix, n) is not None]
     status, reason = fix.status.value, fix.reason
@@ -126,7 +132,7 @@ def fix_row(fix: Fix, boot_id: int, last_byte_boot_id: int) -> SqlRow:
 
 
 def counted_failures(failures: Sequence[DecodeFailure]) -> list[tuple[DecodeFailure, int]]:
-    """Failures with how many of the same device and reason there are; the first of each stands for all."""
+    """Return the first failure of each device and reason, and the number of such failures."""
     first: dict[tuple[str, str], DecodeFailure] = {}
     count: dict[tuple[str, str], int] = {}
     for failure in failures:
@@ -137,12 +143,15 @@ def counted_failures(failures: Sequence[DecodeFailure]) -> list[tuple[DecodeFail
 
 
 def stamp_of(row: Mapping[str, object], boots: Mapping[int, str], prefix: str = "") -> Stamp:
-    """The instant in the columns `<prefix>utc_ns`, `<prefix>monotonic_ns`, `<prefix>boot_id` of a row.
+    """Return the instant in the columns `<prefix>utc_ns`, `<prefix>monotonic_ns`, `<prefix>boot_id` of a row.
 
     Args:
-        row: a row that has them, not NULL.
+        row: a row with these columns, not NULL.
         boots: kernel boot ids by row id.
         prefix: `started_`, `last_byte_`, ...
+
+    Raises:
+        ValueError: the row has no instant in these columns.
     """
     utc_ns, monotonic_ns, boot = (row[f"{prefix}{name}"] for name in ("utc_ns", "monotonic_ns", "boot_id"))
     if not (isinstance(utc_ns, int) and isinstance(monotonic_ns, int) and isinstance(boot, int)):

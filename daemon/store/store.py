@@ -1,4 +1,4 @@
-"""The store that acquisition writes to: runs of the daemon, captured bytes, and the records that are made of them."""
+"""The store that acquisition writes: runs of the daemon, raw captures, and the records decoded from them."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ log = logging.getLogger(__name__)
 
 ChannelKind = Literal["joint", "signal"]
 
-WHOLE_DAEMON = "daemon"  # the channel of gaps in which rigcal itself was not there
+WHOLE_DAEMON = "daemon"  # channel of gaps during which rigcal itself was not running
 
 _SAMPLE_COLUMNS = "(channel_id, utc_ns, monotonic_ns, boot_id, value, status, raw_counts) VALUES (?, ?, ?, ?, ?, ?, ?)"
 _SAMPLES = {
@@ -58,13 +58,14 @@ class Store(Connection):
         path: the database; by convention it ends in `.sqlite`.
 
     Attributes:
-        run_id: row of `daemon_runs`; 0 while no run has begun, and where its row cannot be written.
-        begun: when the run began; None while none has.
-        previous_end: when the run before this one ended, or was last known to be alive; None before the first.
-        ended_in_order: whether the run before this one did; known once a run has begun, true before and without one.
+        run_id: row of `daemon_runs`; 0 before a run has begun, and if its row cannot be written.
+        begun: when the run began; None before.
+        previous_end: when the previous run ended, or was last known to be alive; None for the first run.
+        ended_in_order: whether the previous run shut down cleanly; known once a run has begun, True before that and for
+            the first run.
 
     Raises:
-        StoreError: as a Connection.
+        StoreError: as for a Connection.
     """
 
     def __init__(self, path: Path) -> None:
@@ -85,9 +86,9 @@ class Store(Connection):
     # ---- runs of the daemon ----------------------------------------------------------------------------------------
 
     def begin_run(self, now: Stamp) -> None:
-        """Begin a run of the daemon: a gap covers the time since the last one's links were read, and open gaps end.
+        """Begin a run of the daemon: record a gap since the previous run last read its links, and close its open gaps.
 
-        Where a table of runs or gaps is damaged, the run begins without it, and counts as one after an unclean end.
+        If the table of runs or gaps is damaged, the run begins without it, as after an unclean shutdown.
         """
         self.begun = now
         try:
@@ -97,7 +98,7 @@ class Store(Connection):
         except sqlite3.DatabaseError as error:
             if not is_damage(error):
                 raise
-            log.error("%s: damaged, so what an earlier run left cannot be read or ended: %s", self.path, error)
+            log.error("%s: damaged, so the state left by the previous run cannot be read: %s", self.path, error)
             self.ended_in_order = False
             run_id = self.unless_damaged(lambda: self._note_run(now), 0)
         self.run_id = run_id
@@ -111,14 +112,14 @@ class Store(Connection):
         return self.insert("daemon_runs", run | self.instant(now, "started_") | self.instant(now, "alive_"))
 
     def _note_gap(self, db: Database, now: Stamp) -> None:
-        """Store the gap since the last run, and end those that it left open."""
+        """Store the gap since the previous run, and close the gaps that it left open."""
         runs = self.rows("SELECT * FROM daemon_runs ORDER BY id DESC LIMIT 1")
         if not runs:
             return
         self.ended_in_order = bool(runs[0]["clean"])
         since = self.stamp(runs[0], "alive_")
         last = self.stamp_or_none(runs[0], "ended_") or since
-        # A killed run may have captured something after its last sign of life, but not all that there was.
+        # A killed run may have stored captures after its last heartbeat, but perhaps not all that arrived.
         for row in self.rows(
             "SELECT last_utc_ns, last_monotonic_ns, last_boot_id FROM raw_chunks ORDER BY id DESC LIMIT 1"
         ):
@@ -128,7 +129,7 @@ class Store(Connection):
         self.previous_end = last
         ended = self.instant(last, "end_")
         settings = ", ".join(f"{name} = ?" for name in ended)
-        # Of a gap that began after the last thing that is known, it is known no more than that
+        # A gap that began after the last known instant ends where it began, because nothing more is known
         itself = ", ".join(f"{name} = {name.replace('end_', 'start_')}" for name in ended)
         began_later = "end_utc_ns IS NULL AND start_boot_id = ? AND start_monotonic_ns > ?"
         db.execute(f"UPDATE gaps SET {itself} WHERE {began_later}", [ended["end_boot_id"], ended["end_monotonic_ns"]])
@@ -136,15 +137,15 @@ class Store(Connection):
         self.insert_records([Gap(WHOLE_DAEMON, GapReason.NOT_RUNNING, since, now)])
 
     def note_alive(self, until: Stamp) -> None:
-        """Record until when all that was received is stored: what the run's end loses came after that.
+        """Record the instant up to which all received data are stored; only later data can be lost.
 
-        Harmless when no run has begun.
+        Does nothing if no run has begun.
         """
         if self.run_id:
             self.update("daemon_runs", {"id": self.run_id}, self.instant(until, "alive_"))
 
     def end_run(self, now: Stamp) -> None:
-        """The run ends in order; harmless when none has begun."""
+        """Record a clean shutdown of the run; does nothing if no run has begun."""
         if self.run_id:
             self.update("daemon_runs", {"id": self.run_id}, {**self.instant(now, "ended_"), "clean": True})
             self.run_id = 0
@@ -155,7 +156,7 @@ class Store(Connection):
         """Store captures as chunks that wait to be decoded.
 
         Returns:
-            ids of the chunks, for `mark_decoded`.
+            Ids of the chunks, for `mark_decoded`.
         """
         ids = []
         with self.transaction() as db:
@@ -181,36 +182,36 @@ class Store(Connection):
         return row
 
     def mark_decoded(self, chunk_ids: Iterable[int]) -> None:
-        """The records of these chunks are stored (in the same transaction, or before)."""
+        """Note that the records of these chunks are stored (in the same transaction, or before)."""
         with self.transaction() as db:
             db.conn.executemany("DELETE FROM undecoded_chunks WHERE chunk_id = ?", [(i,) for i in chunk_ids])
 
     def undecoded_chunks(self, after: int = 0, captures: int = 2**62) -> list[int]:
-        """Ids of chunks that wait to be decoded, oldest first.
+        """Return the ids of chunks that wait to be decoded, oldest first.
 
         Args:
-            after: only those with a greater id.
-            captures: no more of them than hold this many, and at least one.
+            after: only chunks with a greater id.
+            captures: stop once the chunks contain this many captures; at least one chunk is returned.
         """
         ids: list[int] = []
         with self._turn:
             for chunk_id, held in self._db.execute(_UNDECODED, [after]):
                 ids.append(chunk_id)
-                captures -= held or 0  # none: the chunk itself is gone, which reading it will tell
+                captures -= held or 0  # NULL if the chunk is missing, which is reported when it is read
                 if captures <= 0:
                     break
         return ids
 
     def newest_undecoded(self) -> int:
-        """Id of the newest chunk that waits to be decoded; 0 where none does."""
+        """Return the id of the newest chunk that waits to be decoded; 0 if there is none."""
         return self.number("SELECT coalesce(max(chunk_id), 0) FROM undecoded_chunks", []) or 0
 
     def chunk_captures(self, chunk_id: int) -> list[Capture]:
-        """The captures of one chunk.
+        """Return the captures of one chunk.
 
         Raises:
             StoreError: the chunk is damaged; the message names it.
-            sqlite3.OperationalError: the disk does not give it at present.
+            sqlite3.OperationalError: the disk cannot be read at present.
         """
         try:
             (row,) = self.rows("SELECT chunk FROM raw_chunks WHERE id = ?", [chunk_id])
@@ -225,7 +226,12 @@ class Store(Connection):
     # ---- records ---------------------------------------------------------------------------------------------------
 
     def declare_channels(self, joints: Mapping[str, str], signals: Mapping[str, str]) -> None:
-        """Say which channels are joints and which are signals, each with its unit; others are taken for signals."""
+        """Declare which channels are joints and which are signals; other channels count as signals.
+
+        Args:
+            joints: joint -> unit.
+            signals: signal -> unit.
+        """
         with self.transaction():
             self._joints = frozenset(joints)
             self._channels.clear()
@@ -244,7 +250,7 @@ class Store(Connection):
         return found
 
     def insert_records(self, records: Iterable[Record]) -> None:
-        """Insert records, each kind into its table; a gap that closes completes the row that its opening made."""
+        """Insert records, each kind into its table; a gap that closes completes the row of its opening."""
         samples: dict[str, list[SqlRow]] = {"joint": [], "signal": []}
         fixes: list[SqlRow] = []
         events: list[SqlRow] = []
@@ -282,7 +288,7 @@ class Store(Connection):
                     self._insert_rows(db, statement, rows)
 
     def _insert_rows(self, db: Database, statement: str, rows: Sequence[SqlRow]) -> None:
-        """Insert rows; those of a damaged table that stand beside the captures must not keep the captures out."""
+        """Insert rows; damage of the tables of gaps or events must not prevent captures from being stored."""
         try:
             db.conn.executemany(statement, rows)
         except sqlite3.DatabaseError as error:
@@ -293,11 +299,11 @@ class Store(Connection):
             self.note_damage(error)
 
     def newest_events(self, most: int) -> list[dict[str, Any]]:
-        """Device, utc_ns, kind and text of the newest device events, newest first."""
+        """Return device, utc_ns, kind and text of the newest device events, newest first."""
         return self.rows("SELECT device, utc_ns, kind, text FROM device_events ORDER BY id DESC LIMIT ?", (most,))
 
     def fix_id(self, fix: Fix) -> int | None:
-        """The row of `fixes` that holds `fix`; None if it is not stored."""
+        """Return the row of `fixes` that contains `fix`; None if it is not stored."""
         return self.number(
             "SELECT id FROM fixes WHERE station = ? AND boot_id = ? AND monotonic_ns = ? ORDER BY id DESC LIMIT 1",
             [fix.station, self.boot_row(fix.stamp), fix.stamp.monotonic_ns],

@@ -1,8 +1,8 @@
 """Views of the store for people and other programs: times as ISO text, joints as columns, units in names.
 
-The columns of joints and signals are those of the channels that the store knows, so the views are made again when a rig
-brings new ones. Each view reads its table row by row and keeps the table's numbers: a query that asks for a session, an
-id or an instant (`boot_id`, `monotonic_ns`) is served by the table's own index.
+There is a column for each joint and signal in the store, so the views are created again when a rig has new channels.
+Each view reads its table row by row and keeps the table's numbers, so that a query by session, id or instant
+(`boot_id`, `monotonic_ns`) uses the table's own index.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ class Channel:
     """A joint or a signal of the store.
 
     Attributes:
-        name: of the channel.
-        unit: of its values.
-        is_joint: a joint, not a signal.
+        name: name of the channel.
+        unit: unit of its values.
+        is_joint: whether it is a joint; otherwise it is a signal.
     """
 
     name: str
@@ -43,7 +43,7 @@ class View:
     """A view.
 
     Attributes:
-        source: what stands behind FROM.
+        source: SQL after FROM.
         columns: name -> SQL of its value.
     """
 
@@ -52,13 +52,13 @@ class View:
 
     @property
     def sql(self) -> str:
-        """The SELECT that it stands for."""
+        """The SELECT statement of the view."""
         listed = ",\n    ".join(f"{sql} AS {_identifier(name)}" for name, sql in self.columns.items())
         return f"SELECT\n    {listed}\nFROM {self.source}"
 
 
 def iso(column: str) -> str:
-    """SQL of an instant in ns as ISO text with microseconds, in UTC."""
+    """Return SQL that converts an instant in ns to ISO text with microseconds, in UTC."""
     return (
         f"strftime('%Y-%m-%dT%H:%M:%S', {column} / 1000000000, 'unixepoch') "
         f"|| printf('.%06dZ', {column} / 1000 % 1000000)"
@@ -66,7 +66,7 @@ def iso(column: str) -> str:
 
 
 def in_session(table: str) -> str:
-    """SQL of FROM and WHERE: the rows of `table`, as `row`, from a session's start to its end.
+    """Return SQL of FROM and WHERE for the rows of `table`, as `row`, from a session's start to its end.
 
     The session's name is the parameter `:session`.
     """
@@ -76,7 +76,7 @@ WHERE session.id = :session AND {between("row.", first, last)}"""
 
 
 def channels_of(db: Database) -> list[Channel]:
-    """Return the channels that a store knows, joints first."""
+    """Return the channels in a store, joints first."""
     return [Channel(name, unit, kind == "joint") for name, unit, kind in db.execute(_CHANNELS).fetchall()]
 
 
@@ -84,7 +84,7 @@ def views(channels: Iterable[Channel]) -> dict[str, View]:
     """Return every view by its name.
 
     Args:
-        channels: joints and signals that get columns.
+        channels: joints and signals with columns.
     """
     channels = list(channels)
     joints = [channel for channel in channels if channel.is_joint]
@@ -216,16 +216,16 @@ def views(channels: Iterable[Channel]) -> dict[str, View]:
 
 
 def drop_views(db: Database) -> None:
-    """Drop the store's views, so that a migration may change their tables."""
+    """Drop the store's views, so that a migration can change their tables."""
     for name in db.view_names():
         if name in views(()):
             db[name].drop()
 
 
 def make_views(db: Database) -> None:
-    """Make the views of a store where they are missing or other channels are known now."""
+    """Create the views of a store that are missing or do not match its channels."""
     for name, view in views(channels_of(db)).items():
-        db.create_view(name, view.sql, replace=True)  # leaves one alone that is the same
+        db.create_view(name, view.sql, replace=True)  # does nothing if the view is the same
 
 
 def _values(channels: Iterable[Channel]) -> dict[str, str]:

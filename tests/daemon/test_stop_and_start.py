@@ -121,7 +121,7 @@ def test_what_a_full_disk_keeps_from_being_stored_before_the_end_is_counted(
     wait_until(lambda: acquisition.status().error is not None)
     with caplog.at_level(logging.CRITICAL):
         acquisition.stop()
-    lost = re.search(r"(\d+) captures could not be stored before the end", caplog.text)
+    lost = re.search(r"(\d+) captures could not be stored before the shutdown", caplog.text)
     assert lost is not None
     assert len(stored(path)) + int(lost[1]) == 3000
     with pytest.raises(AcquisitionError, match="could not be stored"):
@@ -153,7 +153,7 @@ def test_a_stop_does_not_wait_for_a_commit_that_never_ends(
     ending.start()
     try:
         assert closed.wait(DEADLINE_S / 2)
-        assert "captures could not be stored before the end" in caplog.text
+        assert "captures could not be stored before the shutdown" in caplog.text
     finally:
         go_on.set()
         ending.join()

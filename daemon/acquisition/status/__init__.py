@@ -1,1 +1,1 @@
-"""State of acquisition at this moment: gathered while it runs, shown to people, alarms and interfaces."""
+"""Present state of acquisition: gathered while it runs; used by status, alarms and interfaces."""

@@ -1,4 +1,4 @@
-"""Gathers what the writer does, and says at any moment how things are."""
+"""Collects the results of the writer, and gives a snapshot of the state at any time."""
 
 from __future__ import annotations
 
@@ -45,8 +45,8 @@ from drivers.readings import (
     Status,
 )
 
-RATE_WINDOW_S = 2.0  # real time, as batches are
-RATE_WINDOW_BATCHES = 40  # the window's, at the usual 20 batches a second
+RATE_WINDOW_S = 2.0  # real time, like batches
+RATE_WINDOW_BATCHES = 40  # RATE_WINDOW_S at the usual 20 batches a second
 LAG_WINDOW_BATCHES = 1200  # a minute at the usual 20 batches a second
 
 
@@ -64,18 +64,18 @@ class _Link:
 
 
 class StatusBoard:
-    """Gathers what the writer does; may be read from any thread.
+    """Collects the results of the writer; may be read from any thread.
 
     Args:
-        clock: for ages and lags.
-        expected: what should be heard; nothing more is known of what was never heard.
+        clock: clock for ages and lags.
+        expected: devices from which data are expected; a device that never sent data is known only from here.
     """
 
     def __init__(self, clock: Clock, expected: Expected = NOTHING_EXPECTED) -> None:
         self._clock = clock
         self._lock = threading.Lock()
         self._started = clock.now()
-        real_s = clock.real_seconds(1.0) or 1.0  # none passes on a clock that only moves when told to
+        real_s = clock.real_seconds(1.0) or 1.0  # 0 for a clock that moves only when told to
         self._rate_window_ns = round(RATE_WINDOW_S / real_s * NS_PER_S)
         self._channels = {channel.name: channel for channel in expected.channels}
         self._stations = {station.name: station for station in expected.stations}
@@ -97,12 +97,12 @@ class StatusBoard:
         self._error: str | None = None
 
     def set_error(self, error: str | None) -> None:
-        """Why nothing can be stored; None when it can again."""
+        """Set why nothing can be stored; None when it can again."""
         with self._lock:
             self._error = error
 
     def recall(self, events: Sequence[DeviceEvent]) -> None:
-        """Take on what expected channels told before this run; it is counted as nothing that happens now."""
+        """Restore events of expected channels from before this run, without counting them."""
         with self._lock:
             for event in events:
                 if event.device in self._channels:
@@ -110,7 +110,7 @@ class StatusBoard:
                     self._events[event.device, event.kind] = self._event_count, event
 
     def captured(self, captures: Sequence[Capture]) -> None:
-        """Count captures that have just been stored, by link, and note how long the oldest has waited."""
+        """Count captures that have just been stored, by link, and note how long the oldest one has waited."""
         now_ns = self._clock.monotonic_ns()
         counts = Counter([capture.link for capture in captures])
         with self._lock:
@@ -120,7 +120,7 @@ class StatusBoard:
                 self._lags_ns.append(now_ns - min(capture.stamp.monotonic_ns for capture in captures))
 
     def recorded(self, records: Sequence[Record]) -> None:
-        """Take the newest readings, fixes and events from records that have just been stored."""
+        """Note the newest readings, fixes and events of records that have just been stored."""
         with self._lock:
             self._failures.tell_time(self._clock.monotonic_ns())
             decoded: list[str] = []
@@ -149,7 +149,7 @@ class StatusBoard:
         was_open = self._gaps.pop(key, None)
         if gap.end is None:
             self._gaps[key] = gap
-        if was_open is None or was_open.start != gap.start:  # it is told when it opens and again when it closes
+        if was_open is None or was_open.start != gap.start:  # a gap is recorded when it opens and again when it closes
             self._gap_counts[key] += 1
         if gap.end is not None:
             self._missed[key] += gap.missed or 0
@@ -161,7 +161,7 @@ class StatusBoard:
         if event.kind in (EventKind.LINK_UP, EventKind.LINK_LOST):
             link = self._links.setdefault(event.device, _Link(event.stamp))
             is_up = event.kind is EventKind.LINK_UP
-            if link.up is not is_up or is_up:  # a link that is opened anew is heard anew
+            if link.up is not is_up or is_up:  # after reopening a link, its devices start again
                 link.since = event.stamp
             link.up, link.reason = is_up, "" if is_up else event.text
 
@@ -176,10 +176,10 @@ class StatusBoard:
         """Return the state of acquisition at this moment.
 
         Args:
-            intakes: of all links.
-            summaries: of the CAN links.
-            defects: link -> when its decoder last showed a defect.
-            is_behind: as `AcquisitionStatus` has it.
+            intakes: intakes of all links.
+            summaries: summaries of the CAN links.
+            defects: link -> when its decoder last failed by an internal error.
+            is_behind: as in `AcquisitionStatus`.
         """
         heard = {summary.link: summary for summary in summaries}
         now = self._clock.now()
@@ -213,7 +213,7 @@ class StatusBoard:
 
     @staticmethod
     def _known(expected: Mapping[str, object], heard: Mapping[str, object]) -> list[str]:
-        """Return the expected devices in their order, then the others that were heard."""
+        """Return the expected devices in their order, then other devices that have sent data."""
         return [*dict.fromkeys([*expected, *heard])]
 
     def _channel(self, name: str, links: Mapping[str, LinkStatus], now: Stamp) -> ChannelStatus:
@@ -254,7 +254,7 @@ class StatusBoard:
         )
 
     def _per_s(self, link: str, now: Stamp) -> float:
-        """Return a link's captures per second of late, up to now: no batch comes where every link is silent."""
+        """Return a link's recent captures per second, up to now: while all links are silent there are no batches."""
         if not self._history:
             return 0.0
         since_ns = now.monotonic_ns - self._rate_window_ns
@@ -268,7 +268,7 @@ class StatusBoard:
         name = intake.name
         link = self._links.setdefault(name, _Link(self._started))
         if link.up is None and self._totals[name]:
-            link.up = True  # a log that is played back says nothing of a port
+            link.up = True  # a log that is played back contains no report of a port
         if intake.dropped > link.dropped:
             link.dropped, link.dropped_at = intake.dropped, now
         if intake.restarts > link.restarts:
@@ -296,7 +296,7 @@ def _age_s(stamp: Stamp, now: Stamp) -> float:
 
 
 def _open(link: LinkStatus | None) -> tuple[bool | None, float]:
-    """Return the state of a link and since when it has it; unknown of none."""
+    """Return whether a link is open, and for how long its state has lasted; unknown for a missing link."""
     return (None, 0.0) if link is None else (link.up, link.since_s)
 
 

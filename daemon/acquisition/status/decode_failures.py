@@ -1,4 +1,4 @@
-"""Share of the captures that cannot be decoded, and the commonest reason."""
+"""Share of captures that cannot be decoded, and the most frequent reason."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from functools import lru_cache
 
 from drivers.clock import NS_PER_S
 
-WINDOW_NS = 30 * NS_PER_S  # "lately" is the last one to two of these
-KINDS_MAX = 50  # kinds of reasons that are told apart of one device; noise must fill no memory
+WINDOW_NS = 30 * NS_PER_S  # "lately" is the last one to two windows
+KINDS_MAX = 50  # most kinds of reasons counted per device, so that noise cannot fill the memory
 OTHER = "various reasons"
 
 _PARTICULARS = re.compile(r"'[^']*'|\"[^\"]*\"|b'[^']*'|[0-9A-F]*\d[0-9A-Fa-f.]*")
@@ -22,11 +22,11 @@ class DecodeStatus:
 
     Attributes:
         device: channel, station or link.
-        count: captures since the start.
-        reason: the commonest one, as it was given last.
-        reason_count: how many of them it is.
-        lately: how many in the last 30 to 60 s.
-        lately_share: of what the device sent in that time, 0 to 1.
+        count: failed captures since the start.
+        reason: the most frequent reason, as it was last given.
+        reason_count: number of failures for this reason.
+        lately: number of failures in the last 30 to 60 s.
+        lately_share: their share of the device's captures in that time, 0 to 1.
     """
 
     device: str
@@ -38,17 +38,17 @@ class DecodeStatus:
 
 
 class FailureCounter:
-    """Counts failures by device and kind of reason. Belongs to one thread, or to whoever holds its owner's lock."""
+    """Counts failures by device and kind of reason. For one thread, or under its owner's lock."""
 
     def __init__(self) -> None:
         self._counts: dict[str, Counter[str]] = defaultdict(Counter)
         self._examples: dict[tuple[str, str], str] = {}
-        self._failed = Counter[str](), Counter[str]()  # in the window before, and in this one
+        self._failed = Counter[str](), Counter[str]()  # in the previous window, and in the present one
         self._decoded = Counter[str](), Counter[str]()
         self._window_ns = 0
 
     def tell_time(self, now_ns: int) -> None:
-        """Forget what is not of late any more."""
+        """Discard counts of windows that are over."""
         if now_ns - self._window_ns < WINDOW_NS:
             return
         is_next = now_ns - self._window_ns < 2 * WINDOW_NS
@@ -58,11 +58,11 @@ class FailureCounter:
 
     @property
     def decoded(self) -> Counter[str]:
-        """Device -> what was decoded of it in this window; to be added to."""
+        """Device -> number of records decoded in this window; the caller adds to it."""
         return self._decoded[1]
 
     def add(self, device: str, reason: str) -> None:
-        """A capture of a device could not be decoded."""
+        """Count a capture of a device that could not be decoded."""
         kinds = self._counts[device]
         kind = kind_of(reason)
         if kind not in kinds and len(kinds) >= KINDS_MAX:
@@ -72,11 +72,11 @@ class FailureCounter:
         self._failed[1][device] += 1
 
     def totals(self) -> dict[str, int]:
-        """Device -> failures since the start."""
+        """Return device -> number of failures since the start."""
         return {device: kinds.total() for device, kinds in self._counts.items()}
 
     def status(self) -> list[DecodeStatus]:
-        """Every device of which something could not be decoded."""
+        """Return the status of every device with failures."""
         return [self._status(device, kinds) for device, kinds in self._counts.items()]
 
     def _status(self, device: str, kinds: Counter[str]) -> DecodeStatus:
@@ -95,5 +95,5 @@ class FailureCounter:
 
 @lru_cache(maxsize=1024)
 def kind_of(reason: str) -> str:
-    """A reason without what differs from one capture to the next: numbers and quoted bytes."""
+    """Return a reason without the parts that differ between captures: numbers and quoted bytes."""
     return _PARTICULARS.sub("…", reason)

@@ -1,7 +1,7 @@
-"""State of every channel and station at this moment, from its last record and the age of that.
+"""Present state of every channel and station, from its last record, the record's age and the link.
 
-The last reading says what a device was when it was read. Whether it still is follows from its age and from its link:
-status, alarms and interfaces all ask here, so that nothing old is shown as fresh.
+The last reading gives the state of a device when it was read. Its age and its link decide whether that is still valid.
+Status, alarms and interfaces all use this module, so that no old value is shown as fresh.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from calibration.rig.description import Rig
 from daemon.config.config import Config
 from daemon.host.safe_output import duration
 
-STARTING = "starting"  # its link has not been opened yet, or the daemon has just begun to listen
+STARTING = "starting"  # the link is not open yet, or the daemon has just begun to listen
 SILENT = "silent"
 LINK_DOWN = "link_down"
 
@@ -22,13 +22,13 @@ Kind = Literal["joint", "signal"]
 
 @dataclass(frozen=True)
 class ExpectedChannel:
-    """A channel that the rig has.
+    """A channel of the rig.
 
     Attributes:
-        name, unit: of the channel.
-        link: that it is read from.
-        kind: whether it is a joint of the boom.
-        timeout_s: no reading for longer than this is silence.
+        name, unit: name and unit of the channel.
+        link: link from which it is read.
+        kind: joint of the boom, or signal.
+        timeout_s: without a reading for longer than this the channel is silent.
     """
 
     name: str
@@ -40,11 +40,12 @@ class ExpectedChannel:
 
 @dataclass(frozen=True)
 class ExpectedStation:
-    """A station that is configured; its link has its name.
+    """A configured station; its link has the same name.
 
     Attributes:
-        name: of the station.
-        timeout_s: no record for longer than this is silence; 0 for a station that speaks only when it is told to.
+        name: name of the station.
+        timeout_s: without a record for longer than this the station is silent; 0 for a station that sends only on
+            request.
     """
 
     name: str
@@ -53,11 +54,11 @@ class ExpectedStation:
 
 @dataclass(frozen=True)
 class Expected:
-    """Devices that should be heard.
+    """Devices from which data are expected.
 
     Attributes:
-        channels: of the rig.
-        stations: of the configuration.
+        channels: channels of the rig.
+        stations: stations of the configuration.
     """
 
     channels: tuple[ExpectedChannel, ...] = ()
@@ -68,7 +69,7 @@ NOTHING_EXPECTED = Expected()
 
 
 def expected_of(config: Config, rig: Rig) -> Expected:
-    """Return the devices that a configured rig should be heard by."""
+    """Return the devices from which a configured rig should receive data."""
     joints = rig.joint_names
     return Expected(
         tuple(
@@ -82,18 +83,18 @@ def expected_of(config: Config, rig: Rig) -> Expected:
 def present_status(
     last: str | None, age_s: float | None, timeout_s: float, link_up: bool | None, link_since_s: float
 ) -> str:
-    """The status that something has now.
+    """Return the present status of a channel or station.
 
     Args:
-        last: its last status; None if it was never heard.
-        age_s: since then; None if it was never heard.
-        timeout_s: an older one is worth nothing any more; 0: it never grows too old.
-        link_up: its link is open; None while that is not known.
-        link_since_s: for how long that has been so.
+        last: status of its last record; None without a record.
+        age_s: age of that record; None without a record.
+        timeout_s: a record older than this is no longer valid; 0 for no limit.
+        link_up: whether its link is open; None while unknown.
+        link_since_s: for how long the link has been in this state.
 
     Returns:
-        `last` while it is fresh, else LINK_DOWN; STARTING until a link that is open has had the time to bring
-        something; SILENT after it.
+        LINK_DOWN if the link is closed; `last` while its record is fresh; STARTING until an open link has had time to
+        receive a record; otherwise SILENT.
     """
     if link_up is False:
         return LINK_DOWN
@@ -105,16 +106,24 @@ def present_status(
 
 
 def is_present(status: str) -> bool:
-    """Return True if a status is that of a last reading, which is fresh."""
+    """Return True if a status is that of a fresh record."""
     return status not in (STARTING, SILENT, LINK_DOWN)
 
 
 def station_sentence(status: str, age_s: float | None, last_lock: str, last_status: str, reason: str) -> str:
-    """Return the state of a station in one clause: `locked, ok, 0 s ago` or `silent for 40 s (last: locked, ok)`."""
-    words = {STARTING: "not heard yet", SILENT: "silent", LINK_DOWN: "link down"}
+    """Return the state of a station in one clause, such as `locked, ok, 0 s ago`.
+
+    Args:
+        status: present status of the station.
+        age_s: age of its last record; None without a record.
+        last_lock: lock of its last record.
+        last_status: status of its last record.
+        reason: reason in its last record; "" if it has none.
+    """
+    words = {STARTING: "nothing received yet", SILENT: "silent", LINK_DOWN: "link down"}
     if age_s is None:
-        return words[status] if status == STARTING else f"{words[status]}, not heard since the start"
+        return words[status] if status == STARTING else f"{words[status]}, nothing received since the start"
     last = f"{last_lock}, {last_status}" + (f" ({reason})" if reason else "")
     if is_present(status):
         return f"{last}, {duration(age_s)} ago"
-    return f"{words[status]}, not heard for {duration(age_s)} (last: {last})"
+    return f"{words[status]}, nothing received for {duration(age_s)} (last: {last})"

@@ -10,23 +10,23 @@ from daemon.acquisition.status.present import Kind
 
 @dataclass(frozen=True)
 class LinkStatus:
-    """A link.
+    """Present state of a link. Counts are since the start; ages are in seconds.
 
     Attributes:
-        name: of the link.
-        up: its port is open; None before the first word from it.
-        since_s: for how long it has been so.
-        reason: why it is not open; "" while it is, and before the first word.
-        captures: stored since the start.
-        captures_per_s: of the last two seconds.
-        dropped: captures that found the queue full since the start.
-        dropped_age_s: since the last of them were noticed; None without any.
-        queued: waiting to be stored.
-        restarts: how often its loop ended and was started again.
-        restarted_age_s: since that was noticed last; None without any.
-        decoder_failed_age_s: since its decoder last showed a defect of its own; None if it never did.
-        error_frames: CAN error frames since the start; None for other links.
-        unlisted_frames: CAN frames of identifiers that are too many for `AcquisitionStatus.frames`; None likewise.
+        name: name of the link.
+        up: whether its port is open; None before its first report.
+        since_s: for how long the port has been in this state.
+        reason: why it is not open; "" while it is, and before the first report.
+        captures: captures stored.
+        captures_per_s: rate over the last two seconds.
+        dropped: captures lost because the queue was full.
+        dropped_age_s: time since such a loss was last noticed; None without any.
+        queued: items waiting to be stored.
+        restarts: how often its loop ended and was restarted.
+        restarted_age_s: time since a restart was last noticed; None without any.
+        decoder_failed_age_s: time since its decoder last failed by an internal error; None if it never did.
+        error_frames: CAN error frames; None for other links.
+        unlisted_frames: CAN frames whose identifiers did not fit into `AcquisitionStatus.frames`; None for other links.
     """
 
     name: str
@@ -52,11 +52,11 @@ class FrameStatus:
     Attributes:
         link: name of the link.
         identifier: hexadecimal, 3 digits for 11 bits and 8 digits for 29.
-        names: the channels that they feed; for others what the identifier says of itself, "" if nothing.
-        count: since the start.
-        rate_per_s: over about the last 10 s; None before it is known.
-        age_s: since the last one; None if there was none.
-        missed: how many did not arrive since the start, by the counter that they carry; None without one.
+        names: channels decoded from them; for others the standard meaning of the identifier, "" if it has none.
+        count: number since the start.
+        rate_per_s: rate over about the last 10 s; None before it is known.
+        age_s: time since the last frame; None if there was none.
+        missed: number that did not arrive since the start, by the counter in the frames; None without a counter.
     """
 
     link: str
@@ -70,16 +70,16 @@ class FrameStatus:
 
 @dataclass(frozen=True)
 class ChannelStatus:
-    """A joint or signal, as it is now.
+    """Present state of a joint or signal.
 
     Attributes:
-        name, unit: of the channel.
-        value: of its last reading; None unless `status` is ok.
-        status: that of its last reading (drivers.readings.Status) while it is fresh, else `silent`, `link_down` or
-            `starting`.
-        age_s: since its last reading; None if there was none.
-        last_status: of its last reading, however old; None if there was none.
-        link: that it is read from; "" if it is none of the rig's.
+        name, unit: name and unit of the channel.
+        value: value of its last reading; None unless `status` is ok.
+        status: status of its last reading (drivers.readings.Status) while that is fresh, otherwise `silent`,
+            `link_down` or `starting`.
+        age_s: time since its last reading; None if there was none.
+        last_status: status of its last reading, however old; None if there was none.
+        link: link from which it is read; "" if it is not a channel of the rig.
         kind: joint or signal.
     """
 
@@ -95,20 +95,20 @@ class ChannelStatus:
 
 @dataclass(frozen=True)
 class StationStatus:
-    """A total station, as it is now.
+    """Present state of a total station.
 
     Attributes:
-        name: of the station.
-        status: that of its last fix (drivers.readings.Status) while it is fresh, else `silent`, `link_down` or
+        name: name of the station.
+        status: status of its last fix (drivers.readings.Status) while that is fresh, otherwise `silent`, `link_down` or
             `starting`.
-        lock: of its last fix (drivers.readings.LockState) while it is fresh, else `unknown`.
+        lock: lock of its last fix (drivers.readings.LockState) while that is fresh, otherwise `unknown`.
         reason: why the last fix is not ok.
-        age_s: since its last fix; None if there was none.
-        fixes: stored since the start.
-        last_status, last_lock: of its last fix, however old; "" if there was none.
-        good_age_s: since its last fix that is ok; None if there was none.
-        tilt_ok: its last fix says that the compensator works and is in range; None where it does not say.
-        sentence: all of it in one clause, for people.
+        age_s: time since its last fix; None if there was none.
+        fixes: number of fixes since the start.
+        last_status, last_lock: status and lock of its last fix, however old; "" if there was none.
+        good_age_s: time since its last good fix; None if there was none.
+        tilt_ok: whether its last fix reports the compensator as working and in range; None if it does not report this.
+        sentence: summary of the state in one clause, for people.
     """
 
     name: str
@@ -126,13 +126,13 @@ class StationStatus:
 
 @dataclass(frozen=True)
 class GapStatus:
-    """A gap that has not closed.
+    """An open gap.
 
     Attributes:
         channel: joint value, signal, station or link.
         reason: drivers.readings.GapReason.
-        since_utc_ns: the last instant at which it was known to be good.
-        age_s: since then.
+        since_utc_ns: last instant at which the channel was known to be good.
+        age_s: time since then.
     """
 
     channel: str
@@ -143,12 +143,12 @@ class GapStatus:
 
 @dataclass(frozen=True)
 class EventStatus:
-    """The last event of its kind that a device or link had since the start.
+    """The last event of one kind of a device or link since the start.
 
     Attributes:
-        device, kind, text, code: as of the event (drivers.readings.DeviceEvent).
-        utc_ns, age_s: when it was, and how long ago.
-        number: grows from one event to the next, of all devices.
+        device, kind, text, code: as in the event (drivers.readings.DeviceEvent).
+        utc_ns, age_s: instant of the event, and time since then.
+        number: increases from one event to the next, over all devices.
     """
 
     device: str
@@ -162,12 +162,12 @@ class EventStatus:
 
 @dataclass(frozen=True)
 class GapCount:
-    """The gaps of one channel for one reason since the start, open ones too.
+    """The gaps of one channel for one reason since the start, including open ones.
 
     Attributes:
-        channel, reason: as of `GapStatus`.
-        count: how many.
-        missed: how many readings or frames are missing in them, as far as that could be told.
+        channel, reason: as in `GapStatus`.
+        count: number of gaps.
+        missed: number of readings or frames missing in them, as far as known.
     """
 
     channel: str
@@ -178,11 +178,11 @@ class GapCount:
 
 @dataclass(frozen=True)
 class EventCount:
-    """The events of one kind that a device or link had since the start.
+    """The events of one kind of a device or link since the start.
 
     Attributes:
-        device, kind: as of `EventStatus`.
-        count: how many.
+        device, kind: as in `EventStatus`.
+        count: number of events.
     """
 
     device: str
@@ -197,15 +197,15 @@ class AcquisitionStatus:
     Attributes:
         links, frames, channels, stations: see their classes.
         gap_counts, event_counts: see their classes.
-        decode_failures: device -> how many captures could not be decoded since the start.
-        decoding: the same with the commonest reason of each.
-        gaps: those that are open, longest first.
-        last_events: of each device and kind the last one, newest last.
-        writer_lag_s: how old the oldest capture of the last batch was when the batch was stored.
-        writer_lag_p99_s: the same, of the last minute's batches, 99th percentile.
-        error: why something cannot be stored at present; None when all is well.
-        is_behind: captures wait in the store to be decoded, as after a kill: readings and fixes come late.
-        is_write_hung: a write to the store does not end: its disk does not answer, or another program holds it.
+        decode_failures: device -> number of captures that could not be decoded since the start.
+        decoding: the same with the most frequent reason of each device.
+        gaps: open gaps, longest first.
+        last_events: last event of each device and kind, newest last.
+        writer_lag_s: age of the oldest capture of the last batch when the batch was stored.
+        writer_lag_p99_s: 99th percentile of this age over the last minute's batches.
+        error: why data cannot be stored at present; None if they can.
+        is_behind: captures wait in the store to be decoded, as after a kill: readings and fixes are late.
+        is_write_hung: a write to the store does not end; its disk does not answer, or another program holds a lock.
     """
 
     links: list[LinkStatus] = field(default_factory=list)

@@ -1,1 +1,1 @@
-"""The rules that raise and clear alarms: one file a family. A new file, or a new rule in one, needs no other edit."""
+"""The rules that raise and clear alarms, one file per family. A new file or a new rule needs no edit elsewhere."""

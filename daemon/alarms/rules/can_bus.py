@@ -1,4 +1,4 @@
-"""CAN buses and the CANopen nodes on them, by what controllers and nodes say of themselves."""
+"""CAN buses and the CANopen nodes on them, by what the controllers and nodes themselves report."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ _CABLING = "Check cabling, termination (120 ohm at both ends) and bit rate."
 def bus_off(evidence: Evidence) -> Iterator[Finding]:
     """The controller of a CAN link has gone bus-off.
 
-    Cleared when it says that it works again, when the link is opened anew, or when a channel of the link is heard
-    again.
+    Cleared when the controller reports that it works again, when the link is reopened, or when a channel of the link is
+    received again.
     """
     ended_by = EventKind.BUS_ERROR_ACTIVE, EventKind.BUS_ERROR_WARNING, EventKind.BUS_ERROR_PASSIVE, EventKind.LINK_UP
     for event in evidence.active_events(EventKind.BUS_OFF, *ended_by):
@@ -29,9 +29,9 @@ def bus_off(evidence: Evidence) -> Iterator[Finding]:
 
 @rule("warning", _CABLING, hold_s=10.0)
 def bus_error_passive(evidence: Evidence) -> Iterator[Finding]:
-    """The controller of a CAN link is error-passive: every second frame or so is disturbed.
+    """The controller of a CAN link is error-passive: about every second frame is disturbed.
 
-    Cleared 10 s after it says that it is not, or after the link was opened anew.
+    Cleared 10 s after the controller reports a better state, or after the link is reopened.
     """
     ended_by = EventKind.BUS_ERROR_ACTIVE, EventKind.BUS_ERROR_WARNING, EventKind.BUS_OFF, EventKind.LINK_UP
     for event in evidence.active_events(EventKind.BUS_ERROR_PASSIVE, *ended_by):
@@ -39,11 +39,12 @@ def bus_error_passive(evidence: Evidence) -> Iterator[Finding]:
             yield event.device, event.text
 
 
-@rule("warning", "Look at the node: it may be about to fail, or was set up anew without a heartbeat.", after_s=3.0)
+@rule("warning", "Check the node: it may be about to fail, or it was configured without a heartbeat.", after_s=3.0)
 def heartbeat_lost(evidence: Evidence) -> Iterator[Finding]:
-    """A CANopen node has stopped its heartbeat and still sends values: it is not supervised any more.
+    """A CANopen node has stopped its heartbeat but still sends values: it is no longer supervised.
 
-    One that sends nothing at all is a joint or signal that is silent. Cleared when the heartbeat is heard again.
+    A node that sends nothing at all raises the alarm of a silent joint or signal instead. Cleared when the heartbeat is
+    received again.
     """
     present = {channel.name for channel in evidence.acquisition.channels if is_present(channel.status)}
     for event in evidence.active_events(EventKind.HEARTBEAT_LOST, EventKind.HEARTBEAT_RESTORED):
@@ -51,11 +52,11 @@ def heartbeat_lost(evidence: Evidence) -> Iterator[Finding]:
             yield event.device, event.text
 
 
-@rule("critical", "Look the code up in the device's manual; switch it off and on if it says nothing else.")
+@rule("critical", "Look up the code in the device's manual. If it gives no other remedy, switch the device off and on.")
 def emergency(evidence: Evidence) -> Iterator[Finding]:
-    """A CANopen node has sent an emergency (EMCY) and has not taken it back.
+    """A CANopen node has sent an emergency (EMCY) and has not withdrawn it.
 
-    It goes on over a restart of the daemon. Cleared when the node takes back its last error (code 0 with an error
+    The alarm survives a restart of the daemon. Cleared when the node withdraws its last error (code 0 with an error
     register of zero), or boots.
     """
     for event in evidence.active_events(EventKind.EMERGENCY, EventKind.EMERGENCY_CLEARED, EventKind.BOOT_UP):
@@ -63,11 +64,12 @@ def emergency(evidence: Evidence) -> Iterator[Finding]:
             yield event.device, event.text
 
 
-@rule("critical", "Look at the device; `rigcal devices configure` sets it up again where set-up is what failed.")
+@rule("critical", "Check the device. If its set-up has failed, run `rigcal devices configure` to set it up again.")
 def device_alarm(evidence: Evidence) -> Iterator[Finding]:
     """A device reports an alarm (object 6503h), or its set-up has failed.
 
-    Cleared when it says that the alarm is gone, or boots; one of its set-up when it has been set up.
+    Cleared when the device reports that the alarm is gone, or boots. After a failed set-up, cleared when a set-up
+    succeeds.
     """
     set_up = {event.device for event in evidence.active_events(EventKind.ALARM, EventKind.CONFIGURED)}
     for event in evidence.active_events(EventKind.ALARM, EventKind.BOOT_UP):
@@ -76,11 +78,12 @@ def device_alarm(evidence: Evidence) -> Iterator[Finding]:
             yield event.device, event.text
 
 
-@rule("warning", "Do what the warning says; values are used as before.")
+@rule("warning", "Follow the text of the warning. The device's values are still used.")
 def device_warning(evidence: Evidence) -> Iterator[Finding]:
-    """A device has given a warning (object 6505h, its set-up, a station's settings) and has not taken it back.
+    """A device has given a warning (object 6505h, its set-up, a station's settings) and has not withdrawn it.
 
-    Cleared when it does or boots; one that nothing takes back when the link is opened anew.
+    Cleared when the device withdraws it or boots. A warning that the device cannot withdraw is cleared when the link is
+    reopened.
     """
     for event in evidence.active_events(EventKind.WARNING, EventKind.BOOT_UP):
         link = evidence.link_of(event.device)

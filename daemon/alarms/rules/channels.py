@@ -10,61 +10,69 @@ from daemon.alarms.alarm import Finding, rule
 from daemon.alarms.evidence import Evidence
 from drivers.readings import EventKind, Status
 
-START_S = 5.0  # devices take so long to start after their link was opened
-AT_ONCE_S = 0.5  # devices that were heard last so close together fell silent together
+START_S = 5.0  # time that devices need to start after their link was opened
+AT_ONCE_S = 0.5  # devices last received within this time of each other fell silent together
 
 _WHY = {
-    Status.NOT_AVAILABLE: "the device sends that it has no value",
-    Status.OUT_OF_RANGE: "the value is beyond what the device can measure",
-    Status.DEVICE_ALARM: "the device reports an alarm that makes its value void",
+    Status.NOT_AVAILABLE: "the device reports that it has no value",
+    Status.OUT_OF_RANGE: "the value is outside the device's measuring range",
+    Status.DEVICE_ALARM: "the device reports an alarm that makes its value invalid",
     Status.MALFORMED: "the value cannot be decoded",
-    Status.TIME_DOUBTFUL: "this computer reads too late to know when the value was measured; see what keeps it busy",
+    Status.TIME_DOUBTFUL: "this computer reads too late to know when the value was measured; check what keeps it busy",
 }
 
 
-@rule("critical", "Check that the machine is switched on, and the cable between bus and adapter.", after_s=1, hold_s=3)
+@rule("critical", "Check that the machine is on, and check the cable between bus and adapter.", after_s=1, hold_s=3)
 def link_silent(evidence: Evidence) -> Iterator[Finding]:
-    """A CAN link has been open for 5 s, channels of it are silent, and no other frame has come since they were heard.
+    """A CAN link has been open for 5 s, but no frame has arrived on it since its silent channels were last received.
 
-    It explains that they are silent, and they raise no alarms of their own. Cleared 3 s after a frame has come.
+    This alarm stands for all channels of the link; they raise no alarms of their own. Cleared 3 s after a frame has
+    arrived.
     """
     for link, channels in _by_link(evidence).items():
         if evidence.is_storing and _is_quiet(evidence, link, channels) and _has_started(evidence, channels[0]):
-            yield link, "the link is open, and nothing is heard on it"
+            yield link, "the link is open, but nothing is received on it"
 
 
-@rule("critical", "Check the encoder's power and cable; without it no fix can be used.", after_s=1.0, hold_s=3.0)
+@rule(
+    "critical", "Check the encoder's power and cable; without this joint no fix can be used.", after_s=1.0, hold_s=3.0
+)
 def joint_silent(evidence: Evidence) -> Iterator[Finding]:
-    """A joint has not been read for 1 s longer than its time-out, and its link has been open for 5 s.
+    """No reading of a joint has arrived for 1 s longer than its timeout, and its link has been open for 5 s.
 
-    Cleared when it has been read again for 3 s.
+    Cleared when readings have arrived again for 3 s.
     """
     yield from _silent(evidence, "joint")
 
 
-@rule("warning", "Check the signal's device and cable; effects that need it cannot be told.", after_s=1.0, hold_s=3.0)
+@rule(
+    "warning",
+    "Check the signal's device and cable; effects that need this signal cannot be identified.",
+    after_s=1.0,
+    hold_s=3.0,
+)
 def signal_silent(evidence: Evidence) -> Iterator[Finding]:
-    """A machine signal has not been read for 1 s longer than its time-out.
+    """No reading of a machine signal has arrived for 1 s longer than its timeout.
 
     Raised and cleared as for joints.
     """
     yield from _silent(evidence, "signal")
 
 
-@rule("critical", "Look at the device; without the joint no fix can be used.", after_s=1.5, hold_s=3.0)
+@rule("critical", "Check the device; without this joint no fix can be used.", after_s=1.5, hold_s=3.0)
 def joint_not_usable(evidence: Evidence) -> Iterator[Finding]:
-    """The readings of a joint carry no value.
+    """The readings of a joint carry no usable value.
 
-    The device has none, reports an alarm, is out of its range, its value cannot be decoded, or it was read so late that
-    its time is not known. Raised after 1.5 s, so that one bad sample is no alarm; cleared after 3 s of good ones. Where
-    the device's own alarm or emergency stands, it explains that its values are void.
+    The device has no value, reports an alarm or is out of its range; or its value cannot be decoded, or was read too
+    late for its time to be known. Raised after 1.5 s, so that one bad sample raises no alarm; cleared after 3 s of good
+    samples. Not raised where the device's own alarm or emergency is active, which explains the invalid values.
     """
     yield from _not_usable(evidence, "joint")
 
 
-@rule("warning", "Look at the device; effects that need the signal cannot be told.", after_s=1.5, hold_s=3.0)
+@rule("warning", "Check the device; effects that need this signal cannot be identified.", after_s=1.5, hold_s=3.0)
 def signal_not_usable(evidence: Evidence) -> Iterator[Finding]:
-    """The readings of a machine signal carry no value.
+    """The readings of a machine signal carry no usable value.
 
     Raised and cleared as for joints.
     """
@@ -79,9 +87,9 @@ def _by_link(evidence: Evidence) -> dict[str, list[ChannelStatus]]:
 
 
 def _is_quiet(evidence: Evidence, link: str, channels: list[ChannelStatus]) -> bool:
-    """True if the link itself seems to be cut: it has several channels, and nothing came since a silent one was heard.
+    """Return True if the whole link seems cut: it has several channels, and no frame followed a silent one's last.
 
-    Other channels may have longer time-outs: they will be silent in a moment.
+    Other channels may have longer timeouts; they will be silent soon.
     """
     silent = [channel for channel in channels if channel.status == SILENT]
     if len(channels) < 2 or not silent:
@@ -102,8 +110,9 @@ def _silent(evidence: Evidence, kind: str) -> Iterator[Finding]:
             continue
         for channel in channels:
             if channel.kind == kind and channel.status == SILENT and _has_started(evidence, channel):
-                before = "since the start" if channel.last_status is None else f"any more (last: {channel.last_status})"
-                yield channel.name, f"{channel.name} is not heard {before}"
+                is_new = channel.last_status is None
+                text = "not received since the start" if is_new else f"no longer received (last: {channel.last_status})"
+                yield channel.name, f"{channel.name} is {text}"
 
 
 def _not_usable(evidence: Evidence, kind: str) -> Iterator[Finding]:

@@ -11,12 +11,13 @@ from drivers.clock import NS_PER_S
 from drivers.readings import EventKind
 
 STEPPED_S = 900.0
-EARLIEST_NS = round(datetime(2025, 1, 1, tzinfo=UTC).timestamp()) * NS_PER_S  # rigcal is not older
+EARLIEST_NS = round(datetime(2025, 1, 1, tzinfo=UTC).timestamp()) * NS_PER_S  # rigcal did not exist before
 BEHIND_NS = 60 * NS_PER_S
 
 
 @rule(
-    "warning", "See that the clock is right and stays so (NTP); records are ordered by another clock and are not lost."
+    "warning",
+    "Make sure that the clock is right and stays right (NTP). Records are ordered by a separate clock; none are lost.",
 )
 def clock_stepped(evidence: Evidence) -> Iterator[Finding]:
     """The computer's clock was set within the last 15 minutes."""
@@ -24,75 +25,85 @@ def clock_stepped(evidence: Evidence) -> Iterator[Finding]:
         yield event.device, event.text
 
 
-@rule("critical", "Set the computer's clock; if it starts so each time, change the battery of its clock.")
+@rule("critical", "Set the computer's clock. If it is wrong after every start, replace the clock's battery.")
 def clock_behind(evidence: Evidence) -> Iterator[Finding]:
-    """The computer's clock stands before the year 2025, or at an earlier time than when rigcal last ran.
+    """The computer's clock shows a date before 2025, or a time before rigcal's last run.
 
-    Cleared when it is set.
+    Cleared when the clock is set.
     """
     now_ns, before = evidence.now.utc_ns, evidence.previous_run
     if now_ns < EARLIEST_NS:
-        yield "clock", f"the computer's clock stands at {_utc(now_ns):%Y-%m-%d}"
+        yield "clock", f"the computer's clock shows the date {_utc(now_ns):%Y-%m-%d}"
     elif before is not None and now_ns < before.utc_ns - BEHIND_NS:
         last = f"{_utc(before.utc_ns):%Y-%m-%d %H:%M} UTC"
-        yield "clock", f"the computer's clock stands at an earlier time than {last}, when rigcal last ran"
+        yield "clock", f"the computer's clock shows a time before {last}, when rigcal last ran"
 
 
 @rule(
     "warning",
-    "Look after the time service and its network (`chronyc tracking`, `timedatectl`); where the rig has none any more, "
-    "restarting rigcal ends the alarm. Records are ordered by another clock, and lose nothing.",
+    "Check the time service and its network (`chronyc tracking`, `timedatectl`). If the rig no longer has a time "
+    "service, restart rigcal to clear the alarm. Records are ordered by a separate clock; none are lost.",
     after_s=600.0,
 )
 def clock_unsynchronized(evidence: Evidence) -> Iterator[Finding]:
-    """A time service kept the computer's clock in this run of rigcal, and has not for 10 minutes.
+    """A time service synchronised the computer's clock in this run of rigcal, but has not for 10 minutes.
 
-    A computer whose clock nobody keeps, such as that of a rig without a network, has no such alarm: its clock is off by
-    some seconds a day, which matters to people who read times, and to nothing else.
+    Not raised where no time service has synchronised the clock in this run, such as on a rig without a network: the
+    clock then drifts by some seconds a day, which matters only to people who read the times.
     """
     if evidence.clock_lost is not None:
-        yield "clock", f"the computer's clock was synchronised until {_utc(evidence.clock_lost.utc_ns):%H:%M} UTC"
+        yield "clock", f"the computer's clock was last synchronised at {_utc(evidence.clock_lost.utc_ns):%H:%M} UTC"
 
 
-@rule("warning", "Look what else the computer does; nothing is lost, and it stops by itself.", after_s=60.0, hold_s=5.0)
+@rule(
+    "warning",
+    "Check what else keeps the computer busy. Nothing is lost, and the backlog clears by itself.",
+    after_s=60.0,
+    hold_s=5.0,
+)
 def decoding_behind(evidence: Evidence) -> Iterator[Finding]:
-    """Captures have waited in the store to be decoded for a minute.
+    """For a minute, captures in the store have been waiting to be decoded.
 
-    After a kill, or where the computer is too slow: readings and fixes come late, and no job is started.
+    This happens after an unclean shutdown, or where the computer is too slow. Readings and fixes are late, and no job
+    is started.
     """
     if evidence.acquisition.is_behind:
-        yield "decoding", "captures wait to be decoded: readings and fixes come late, and jobs wait"
+        yield "decoding", "captures are waiting to be decoded: readings and fixes are late, and jobs wait"
 
 
-@rule("critical", "Put right what the text says; if the alarm stays, restart rigcal: `systemctl restart rigcal`.")
+@rule("critical", "Correct what the alarm names. If the alarm stays, restart rigcal: `systemctl restart rigcal`.")
 def control_dead(evidence: Evidence) -> Iterator[Finding]:
     """No one can connect to a control socket of the daemon.
 
-    Its file was replaced or cannot be made, or the computer lacks descriptors. Cleared when commands are taken
-    again.
+    Its file was replaced or cannot be created, or the computer is short of descriptors. Cleared when clients can
+    connect again.
     """
     yield from evidence.control_faults.items()
 
 
-@rule("critical", "Restart rigcal: `systemctl restart rigcal`, and report the fault with its log.")
+@rule("critical", "Restart rigcal (`systemctl restart rigcal`), and report the fault together with rigcal's log.")
 def thread_ended(evidence: Evidence) -> Iterator[Finding]:
-    """An error has ended a thread of the daemon: what it did is not done any more.
+    """An error has ended a thread of the daemon, so that its work is no longer done.
 
-    The threads that read links, keep the store, run jobs and send notices go on after an error, or have alarms of
+    The threads that read links, write the store, run jobs and send notices continue after an error, or have alarms of
     their own. Cleared when rigcal is restarted.
     """
     for name, why in evidence.ended_threads.items():
         yield name, f"the thread {name} has ended: {why}"
 
 
-@rule("warning", "Report the fault with rigcal's log; alarms of this sort stand as they were.", hold_s=5.0)
+@rule(
+    "warning",
+    "Report the fault together with rigcal's log. Until it is corrected, alarms of this kind keep their last state.",
+    hold_s=5.0,
+)
 def not_watched(evidence: Evidence) -> Iterator[Finding]:
-    """A rule of an alarm, or what it looks at, has failed itself.
+    """A rule of an alarm, or a check that it depends on, has itself failed.
 
     Cleared 5 s after it works again.
     """
     for part, why in evidence.unwatched.items():
-        yield part, f"{part} cannot be watched: {why}"
+        yield part, f"{part} cannot be checked: {why}"
 
 
 def _utc(utc_ns: int) -> datetime:

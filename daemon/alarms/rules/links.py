@@ -1,4 +1,4 @@
-"""Links: ports that are closed, loops that fail, a queue that overflows."""
+"""Links: closed ports, failed reading loops, an overflowing queue."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from daemon.alarms.alarm import Finding, rule
 from daemon.alarms.evidence import Evidence
 from drivers.readings import EventKind
 
-OPENING_S = 15.0  # a link that has said nothing of its port for so long does not open
+OPENING_S = 15.0  # a link that has reported nothing about its port for this long does not open
 LATELY_S = 300.0
 
 
-@rule("critical", "Check the plug, the adapter and its power; rigcal opens the link again by itself.", hold_s=3.0)
+@rule("critical", "Check the plug, the adapter and its power. rigcal reopens the link by itself.", hold_s=3.0)
 def link_down(evidence: Evidence) -> Iterator[Finding]:
     """A link is closed: its port cannot be opened, or was lost.
 
-    What its channels lack is explained by this alarm and raises none of its own. A station's link is a warning
-    while no session is open. Cleared 3 s after the link has been opened, so that a loose plug is one alarm. Not raised
-    where `simulated_rig_ended` is.
+    This alarm stands for all faults of the link's devices that it explains; they raise no alarms of their own. It is a
+    warning for a station's link while no session is open. Cleared 3 s after the link is open again, so that a loose
+    plug raises only one alarm. Not raised while `simulated_rig_ended` is active.
     """
     if evidence.has_simulation_ended:
         return
@@ -35,24 +35,24 @@ def link_down(evidence: Evidence) -> Iterator[Finding]:
         yield link.name, text, "warning" if is_idle else "critical"
 
 
-@rule("critical", "Stop the daemon; `rigcal run --sim` starts it again with a simulated rig.")
+@rule("critical", "Stop the daemon, and start it again with a new simulated rig: `rigcal run --sim`.")
 def simulated_rig_ended(evidence: Evidence) -> Iterator[Finding]:
     """The process of the simulated rig of `rigcal run --sim` has ended, which closes all links."""
     if evidence.has_simulation_ended:
         yield "simulation", "the simulated rig has ended, so nothing is measured"
 
 
-@rule("warning", "Report the fault with rigcal's log; what the link brought meanwhile is lost.")
+@rule("warning", "Report the fault together with rigcal's log. Data that arrived between failure and restart are lost.")
 def link_restarted(evidence: Evidence) -> Iterator[Finding]:
-    """The loop that reads a link has ended by a fault of its own and was started again within the last 5 minutes."""
+    """The loop that reads a link has ended by an internal error and was restarted within the last 5 minutes."""
     for link in evidence.acquisition.links:
         if link.restarted_age_s is not None and link.restarted_age_s <= LATELY_S:
-            yield link.name, "the loop that reads the link has failed and was started again"
+            yield link.name, "the loop that reads the link has failed and was restarted"
 
 
-@rule("critical", "Free space, or check whether the disk is too slow or faulty.", hold_s=5.0)
+@rule("critical", "Free space on the disk, or check whether it is too slow or faulty.", hold_s=5.0)
 def queue_full(evidence: Evidence) -> Iterator[Finding]:
-    """Captures of a link found the queue to the store full and were lost within the last 5 s."""
+    """Within the last 5 s captures of a link were lost because the queue to the store was full."""
     for link in evidence.acquisition.links:
         if link.dropped_age_s is not None and link.dropped_age_s <= 5.0:
             yield link.name, "captures are being lost: the queue to the store is full"
@@ -65,12 +65,12 @@ def frames_lost(evidence: Evidence) -> Iterator[Finding]:
         yield event.device, event.text
 
 
-@rule("warning", "See what else keeps the computer busy, and whether its clock is set while rigcal runs.")
+@rule("warning", "Check what else keeps the computer busy, and whether its clock is being set while rigcal runs.")
 def time_doubtful(evidence: Evidence) -> Iterator[Finding]:
-    """Within the last 5 minutes captures came at instants that are not known.
+    """Within the last 5 minutes captures arrived whose time of arrival is not known.
 
-    The link was not read for a while, or the clock was set. They are stored and marked, and their readings are not
-    used.
+    The link was not read for a while, or the clock was set. Such captures are stored and marked, but their readings are
+    not used.
     """
     for event in evidence.recent_events(EventKind.TIME_DOUBTFUL, LATELY_S):
         yield event.device, event.text
@@ -78,18 +78,18 @@ def time_doubtful(evidence: Evidence) -> Iterator[Finding]:
 
 @rule("warning", "Check bit rate, wiring and the description of the device (DBC, EDS, profile).", hold_s=60.0)
 def decode_failures(evidence: Evidence) -> Iterator[Finding]:
-    """One in a hundred captures of a device or more, and ten at least, could not be decoded in the last minute or so.
+    """In about the last minute, at least 10 captures of a device, and at least 1 % of them, could not be decoded.
 
-    Cleared when it has been fewer for a minute.
+    Cleared when fewer have failed for a minute.
     """
     for device in evidence.acquisition.decoding:
         if device.lately >= 10 and device.lately_share >= 0.01 and not evidence.is_cut_off(device.device):
-            yield device.device, f"captures cannot be decoded, mostly: {kind_of(device.reason)}"
+            yield device.device, f"captures cannot be decoded; most frequent reason: {kind_of(device.reason)}"
 
 
-@rule("critical", "Report the fault with rigcal's log; the raw captures are kept and can be decoded again.")
+@rule("critical", "Report the fault together with rigcal's log. Raw captures are kept and can be decoded again.")
 def decoder_defective(evidence: Evidence) -> Iterator[Finding]:
-    """The decoder of a link has failed by a fault of its own within the last 10 minutes."""
+    """The decoder of a link has failed by an internal error within the last 10 minutes."""
     for link in evidence.acquisition.links:
         if link.decoder_failed_age_s is not None and link.decoder_failed_age_s <= 600.0:
-            yield link.name, "the decoder of the link is defective; its captures are kept"
+            yield link.name, "the decoder of the link failed by an internal error; its captures are kept"

@@ -1,4 +1,4 @@
-"""Total stations: silent, not locked, tilted, in error, on another prism."""
+"""Total stations: silent, not locked, tilted, in error, on a wrong prism."""
 
 from __future__ import annotations
 
@@ -14,28 +14,36 @@ _TURNED_AWAY = (LockState.STANDBY, LockState.SEARCHING, LockState.WAITING, LockS
 
 
 @rule(
-    "critical", "Check that the station is on, its cable, and its settings (baud rate, parity, line end).", hold_s=3.0
+    "critical",
+    "Check that the station is on; check its cable and its settings (baud rate, parity, line end).",
+    hold_s=3.0,
 )
 def station_silent(evidence: Evidence) -> Iterator[Finding]:
-    """A station gives no records for longer than its time-out, and nothing that it has sent waits to be decoded.
+    """A station has sent no records for longer than its timeout, and none of its captures wait to be decoded.
 
-    A warning while no session is open. Cleared 3 s after it is heard again. While its link is closed that alarm stands
-    for this one.
+    A warning while no session is open. Cleared 3 s after it sends again. Not raised while the station's link is closed,
+    which has its own alarm.
     """
-    # A status is silent also while fixes wait for a busy computer; a gap opens once all that was captured is decoded.
+    # The status is also silent while fixes wait for a busy computer; a gap opens only once all captures are decoded.
     speaks = {link.name for link in evidence.acquisition.links if link.captures_per_s > 0.0}
     gaps = {gap.channel for gap in evidence.acquisition.gaps if gap.reason == GapReason.SILENT}
     for station in evidence.acquisition.stations:
         is_silent = station.status == SILENT and (station.name in gaps or station.name not in speaks)
         if evidence.is_storing and is_silent:
-            yield station.name, "the station gives no records", "warning" if evidence.session is None else "critical"
+            yield station.name, "the station sends no records", "warning" if evidence.session is None else "critical"
 
 
-@rule("warning", "Aim the station at the session's prism; check what blocks the line of sight.", after_s=2.5, hold_s=3)
+@rule(
+    "warning",
+    "Aim the station at the session's prism, and check whether something blocks the line of sight.",
+    after_s=2.5,
+    hold_s=3,
+)
 def station_not_locked(evidence: Evidence) -> Iterator[Finding]:
-    """A station follows no prism for 2.5 s while a session is open; it has gone on as if it did for a second before.
+    """A station has followed no prism for 2.5 s while a session is open.
 
-    Searching and waiting are usual at other times. Cleared when it has been locked for 3 s.
+    Before it reports the loss, a station predicts the prism's motion for about a second. Without an open session,
+    searching and waiting are normal. Cleared when the station has been locked for 3 s.
     """
     for station in evidence.acquisition.stations:
         if evidence.session is not None and is_present(station.status) and station.lock in _TURNED_AWAY:
@@ -46,18 +54,18 @@ def station_not_locked(evidence: Evidence) -> Iterator[Finding]:
     "critical", "Level the instrument, or switch its compensator on; then describe a new set-up.", after_s=3, hold_s=3
 )
 def station_tilted(evidence: Evidence) -> Iterator[Finding]:
-    """A station says that its compensator is out of range or off, for 3 s; its fixes are not used."""
+    """A station has reported for 3 s that its compensator is out of range or off; its fixes are not used."""
     for station in evidence.acquisition.stations:
         if is_present(station.status) and station.tilt_ok is False:
             yield station.name, station.reason or "the compensator is out of range or off"
 
 
-@rule("warning", "Look at the instrument's display; its manual explains an error code.")
+@rule("warning", "Check the instrument's display; its manual explains the error codes.")
 def instrument_error(evidence: Evidence) -> Iterator[Finding]:
-    """A station has reported an error, refused a command or not answered.
+    """A station has reported an error, refused a command, or not answered a command.
 
-    Cleared when it has given a good fix since, and half a minute after the last error at the earliest. While it is
-    silent that alarm stands for this one.
+    Cleared when it has given a good fix since, and at the earliest half a minute after the last error. Not raised while
+    the station is silent, which has its own alarm.
     """
     good_s = {station.name: station.good_age_s for station in evidence.acquisition.stations}
     silent = {station.name for station in evidence.acquisition.stations if station.status == SILENT}
@@ -68,42 +76,46 @@ def instrument_error(evidence: Evidence) -> Iterator[Finding]:
             yield event.device, event.text
 
 
-@rule("critical", "Aim the station at the session's prism; if it is on it, say `rigcal session confirm-prism`.")
+@rule(
+    "critical",
+    "Aim the station at the session's prism. If it is already on that prism, run `rigcal session confirm-prism`.",
+)
 def prism_jump(evidence: Evidence) -> Iterator[Finding]:
-    """A station's target jumped further than a boom can move while a session is open.
+    """While a session is open, a station's target has jumped further than a boom can move.
 
-    It may follow another prism, and its fixes do not count. Cleared when the target is the earlier one again, when
-    an operator confirms the prism, and with the session; never by time.
+    The station may follow a different prism, and its fixes are not used. Cleared when the target is the earlier one
+    again, when an operator confirms the prism, or when the session ends; never by the passing of time.
     """
     for suspicion in evidence.suspicions:
-        yield suspicion.station, f"{suspicion.reason}; its fixes do not count"
+        yield suspicion.station, f"{suspicion.reason}; its fixes are not used"
 
 
 @rule(
     "warning",
-    "Check which prism the station is on, and cover reflections. If it is on the session's, `rigcal session "
-    "confirm-prism` says so.",
+    "Check which prism the station follows, and cover reflecting surfaces. If it follows the session's prism, run "
+    "`rigcal session confirm-prism`.",
     hold_s=10.0,
 )
 def fixes_elsewhere(evidence: Evidence) -> Iterator[Finding]:
-    """Fixes of one standstill lie at two places, too near to each other for `prism_jump`.
+    """Fixes of one standstill lie at two places, which are too close to each other for `prism_jump`.
 
-    Those of the place with fewer fixes do not count. Cleared 10 s after the newest fix counts, or with the session.
+    Fixes of the place with fewer fixes are not used. Cleared 10 s after the newest fix is used again, or when the
+    session ends.
     """
     why = evidence.newest_excluded
     if evidence.session is not None and not evidence.suspicions and why is not None and why.startswith(ELSEWHERE):
-        yield evidence.session.id, f"fixes do not count: {why}"
+        yield evidence.session.id, f"fixes are not used: {why}"
 
 
 @rule(
     "warning",
-    "Put right what the text says the computer lacks; if the alarm stays, restart rigcal. Meanwhile see yourself "
-    "that each lock is on the session's prism.",
+    "Provide what the alarm says the computer lacks. If the alarm stays, restart rigcal. Until then, check yourself at "
+    "each lock that the station is on the session's prism.",
 )
 def prisms_not_compared(evidence: Evidence) -> Iterator[Finding]:
-    """The joints cannot be asked whether a station is on the session's prism: the mathematics cannot be loaded.
+    """A station's prism cannot be checked against the joints, because the mathematical code cannot be loaded.
 
-    A wrong prism is noticed by its distance alone. It is tried again every 30 s.
+    A wrong prism is then detected by its distance alone. Loading is retried every 30 s.
     """
     if evidence.prisms_fault is not None:
-        yield "prisms", f"wrong prisms are noticed by their distance alone: {evidence.prisms_fault}"
+        yield "prisms", f"wrong prisms are detected by their distance alone: {evidence.prisms_fault}"

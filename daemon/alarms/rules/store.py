@@ -12,12 +12,12 @@ CRITICAL_BYTES = 200 * 2**20
 OVERDUE_NS = 3 * 86_400 * NS_PER_S
 
 
-@rule("critical", "Free space on the disk, or check it; captures wait in memory meanwhile.", hold_s=5.0)
+@rule("critical", "Free space on the disk, or check the disk. Until then captures are held in memory.", hold_s=5.0)
 def not_storing(evidence: Evidence) -> Iterator[Finding]:
     """Nothing can be written to the store.
 
-    What comes is decoded only when it is stored, so silence of links, channels and stations raises no alarms
-    meanwhile. Cleared 5 s after it can be written again.
+    Captures are decoded only after they are stored, so silence of links, channels and stations raises no alarms
+    meanwhile. Cleared 5 s after the store can be written again.
     """
     if evidence.acquisition.error is not None:
         yield "store", evidence.acquisition.error
@@ -25,47 +25,51 @@ def not_storing(evidence: Evidence) -> Iterator[Finding]:
 
 @rule(
     "critical",
-    "Check the disk of the store, and its cable; captures wait in memory meanwhile.",
+    "Check the disk of the store and its cable. Captures wait in memory until the disk answers.",
     after_s=1.0,
     hold_s=5.0,
 )
 def store_hangs(evidence: Evidence) -> Iterator[Finding]:
     """A write to the store has not ended for 4 s: its disk does not answer, or the computer is too busy.
 
-    Captures wait in memory and are stored when the write ends. If it does not, the watchdog restarts rigcal. Silence of
-    links, channels and stations raises no alarms meanwhile. Cleared 5 s after the write has ended.
+    Captures wait in memory and are stored when the write ends. If it does not end, the watchdog restarts rigcal. Silent
+    links, channels and stations raise no alarms meanwhile. Cleared 5 s after the write has ended.
     """
     if evidence.acquisition.is_write_hung and evidence.acquisition.error is None:
         yield "store", "a write to the store does not end"
 
 
-@rule("critical", "Do what the alarm says before you stop rigcal: a deleted file is lost for good when rigcal stops.")
+@rule("critical", "Follow the alarm text before you stop rigcal: a deleted file is lost for good when rigcal stops.")
 def store_unsound(evidence: Evidence) -> Iterator[Finding]:
-    """The store is damaged, or a file of it was replaced or is gone."""
+    """The store is damaged, or one of its files was replaced or is missing."""
     if evidence.store is not None and evidence.store.is_unsound:
         yield "store", evidence.store.text
 
 
-@rule("critical", "Stop rigcal and restore the store from a backup; if a new one is meant, move the old models away.")
+@rule(
+    "critical",
+    "Stop rigcal and restore the store from a backup. If the new store is intended, move the old models away.",
+)
 def store_new(evidence: Evidence) -> Iterator[Finding]:
     """The store is new, but models lie beside it.
 
-    The store that they came from was deleted or moved, and with it its sessions, set-ups and live model. Cleared
-    with the first job of the new store, or when the models are moved away.
+    The store to which these models belong was deleted or moved, together with its sessions, set-ups and live model.
+    Cleared with the first job of the new store, or when the models are moved away.
     """
     if evidence.is_store_new:
-        yield "store", "the store is new and empty, but models of an earlier one lie beside it"
+        yield "store", "the store is new and empty, but models of an earlier store lie beside it"
 
 
 @rule(
     "warning",
-    "Free space on the disk of the store, or move the state directory to a larger one: docs/how-to/store.md says how.",
+    "Free space on the disk of the store, or move the state directory to a larger disk as docs/how-to/store.md "
+    "describes.",
 )
 def store_short_of_room(evidence: Evidence) -> Iterator[Finding]:
-    """The store has less room to grow than `free_gb` of its configuration: the oldest captures outside sessions go.
+    """The store has less space to grow than `free_gb`, so the oldest captures outside sessions are deleted.
 
-    Room is what is free on the disk and in the store's own file. Critical where nothing is left that may be deleted.
-    Cleared when there is room again.
+    Free space on the disk and in the store's own file is counted. Critical when nothing more may be deleted.
+    Cleared when there is enough space again.
     """
     keeping = evidence.keeping
     if not keeping.is_short:
@@ -73,35 +77,35 @@ def store_short_of_room(evidence: Evidence) -> Iterator[Finding]:
     if keeping.has_nothing_left:
         yield (
             "store",
-            "little room is left, and nothing that may be deleted: only sessions and the last hour",
+            "little space is left, and nothing more may be deleted: only sessions and the last hour remain",
             "critical",
         )
     else:
-        yield "store", "little room is left, so the oldest captures outside sessions are deleted"
+        yield "store", "little space is left, so the oldest captures outside sessions are deleted"
 
 
-@rule("warning", "Look at the disk of the backups; `rigcal store backup` makes one now and says what is wrong.")
+@rule("warning", "Check the disk of the backups; `rigcal store backup` makes a backup now and shows what is wrong.")
 def backup_overdue(evidence: Evidence) -> Iterator[Finding]:
-    """The last backup failed, has not ended for 6 hours, or the newest is older than 3 days.
+    """The last backup failed or has run for 6 hours, or the newest backup is older than 3 days.
 
-    Cleared by the next one that is made.
+    Cleared by the next successful backup.
 
-    Only where `backup_directory` is configured.
+    Raised only where `backup_directory` is configured.
     """
     keeping = evidence.keeping
     if not keeping.has_backups:
         return
     if keeping.backup_error:
-        yield "backup", f"no backup was made: {keeping.backup_error}"
+        yield "backup", f"the backup failed: {keeping.backup_error}"
     elif keeping.newest_backup_utc_ns is not None and evidence.now.utc_ns - keeping.newest_backup_utc_ns > OVERDUE_NS:
         yield "backup", "the newest backup is older than 3 days"
 
 
 @rule("warning", "Free space on the disk of the store.", hold_s=60.0)
 def disk_nearly_full(evidence: Evidence) -> Iterator[Finding]:
-    """Little of the store's disk is free: less than 1 GiB, or less than 5 % and 10 GiB.
+    """Little of the store's disk is free: less than 1 GiB, or less than both 5 % and 10 GiB.
 
-    Critical below 200 MiB. Cleared after a minute with more.
+    Critical below 200 MiB. Cleared after a minute with more free space.
     """
     store = evidence.store
     if store is None:

@@ -1,4 +1,4 @@
-"""A stored session as captured logs again, with what `rigcal replay` must know of them, and its observations CSV."""
+"""Export of a stored session as captured logs, with the session file for `rigcal replay` and the observations CSV."""
 
 from __future__ import annotations
 
@@ -29,35 +29,34 @@ from drivers.readings import CanCapture, Capture, SerialCapture
 
 CanFormat = Literal["log", "asc", "blf"]
 
-JOINED_WITHIN_S = 5.0  # after its end, where links are alive; from a daemon that was killed nothing comes any more
+JOINED_WITHIN_S = 5.0  # after the session's end, if links are alive; a killed daemon joins no more fixes
 LOOK_S = 0.1
-_BETWEEN_BOOTS_NS = 1_000_000  # at least: logs have microseconds, and what came first must come first again
+_BETWEEN_BOOTS_NS = 1_000_000  # smallest distance of boots: logs have microseconds, and the order must be kept
 
 
 def export_session(config: Config, session_id: str, out: Path, can_format: CanFormat) -> list[Path]:
-    """Write a session's captures, a file a link, what the operator said of it, and its observations.
+    """Write a session's captures, one file per link, the operator's commands, and its observations.
 
-    Logs know UTC alone, so the captures' is made steady: what was recorded while the computer's clock was set must not
-    come again at another time than what came before and after it. Nor can logs say that a capture's time is doubtful:
-    the session file does.
+    Logs contain UTC only, so steps of the computer's clock are removed from it: otherwise captures recorded around a
+    step would be replayed at wrong times. Logs cannot mark a capture whose time is doubtful; the session file does.
 
     Args:
-        config: of the daemon whose store it is; gives the stations' profiles and speeds.
+        config: configuration of the daemon that wrote the store; it gives the stations' profiles and speeds.
         session_id: a session that has ended.
-        out: directory, made if need be.
-        can_format: of the CAN logs: candump `log`, Vector `asc` or `blf`.
+        out: directory, created if needed.
+        can_format: format of the CAN logs: candump `log`, Vector `asc` or `blf`.
 
     Returns:
         The files, `<session>-<link>.<format>`, `<session>-<station>.serial`, `<session>.json` and `<session>.csv`.
 
     Raises:
-        CommandError: no such session, or it is still open.
+        CommandError: there is no such session, it is still open, or it is not decoded.
         ConfigError: its station is not in the configuration.
     """
     with Reader(config.store_path) as reader:
         found = ended_session(reader, session_id)
         out.mkdir(parents=True, exist_ok=True)
-        # A damaged store must leave no part of a log that looks like the whole
+        # A damaged store must not leave an incomplete log that looks complete
         with tempfile.TemporaryDirectory(prefix=f".{session_id}.", dir=out) as scratch:
             files = _write(reader, config, found, Path(scratch), can_format)
             return [file.replace(out / file.name) for file in files]
@@ -120,11 +119,15 @@ def _write(reader: Reader, config: Config, found: Mapping[str, Any], out: Path, 
 
 
 def ended_session(reader: Reader, session_id: str) -> dict[str, Any]:
-    """Return the row of a session that has ended, once its last captures are decoded and its last fixes are joined.
+    """Return the row of an ended session, once its last captures are decoded and its last fixes are joined.
+
+    Args:
+        reader: the store.
+        session_id: the session.
 
     Raises:
-        CommandError: no such session, it is still open, or its captures wait to be decoded for longer than they do
-            behind a session that was just stopped.
+        CommandError: there is no such session, it is still open, or its captures are not decoded within the time that
+            a session that was just stopped needs.
     """
     found = session(reader, session_id)
     if found is None:
@@ -136,17 +139,18 @@ def ended_session(reader: Reader, session_id: str) -> dict[str, Any]:
         time.sleep(LOOK_S)
     if is_undecoded(reader, session_id, AFTER_NS):
         raise CommandError(
-            f"captures of session {session_id!r} wait to be decoded, so its tables are not whole; `rigcal run` "
-            "decodes them: export it when `rigcal store stats` says that none wait"
+            f"captures of session {session_id!r} wait to be decoded, so its tables are incomplete; `rigcal run` "
+            "decodes them: export the session when `rigcal store stats` shows that none wait"
         )
     return found
 
 
 class _SteadyTime:
-    """Puts instants on one axis: UTC as it was at the first instant of each boot, and no boot before the one before.
+    """Puts instants on one axis of UTC without steps of the computer's clock.
 
-    So UTC has no steps of a computer's clock: within a boot, time passes as the monotonic clock says. The first and the
-    last instant of each boot come first, whichever link they are of: a link may have fallen silent before the others.
+    Within a boot, time follows the monotonic clock from the UTC of the boot's first instant; a boot never begins before
+    the previous one ends. The first and the last instant of each boot, of all links, must be given first, because one
+    link may have fallen silent before the others.
     """
 
     def __init__(self) -> None:
@@ -154,7 +158,7 @@ class _SteadyTime:
         self._latest_ns = -(2**63)
 
     def of(self, stamp: Stamp) -> Stamp:
-        """Return the stamp of an instant with steady UTC in place of the computer's."""
+        """Return the stamp with steady UTC instead of the computer's."""
         if stamp.boot_id not in self._offsets_ns:
             self._offsets_ns[stamp.boot_id] = (
                 max(stamp.utc_ns, self._latest_ns + _BETWEEN_BOOTS_NS) - stamp.monotonic_ns
@@ -165,7 +169,7 @@ class _SteadyTime:
 
 
 class _Doubts:
-    """Notes which of the captures that pass are of doubtful time, as DoubtfulCaptures has it."""
+    """Notes which of the captures passed through are of doubtful time, for a `DoubtfulCaptures`."""
 
     def __init__(self) -> None:
         self.captures = 0

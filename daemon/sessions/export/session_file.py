@@ -1,4 +1,4 @@
-"""The file of an exported session: the commands of its operator, which its captures do not tell."""
+"""The file of an exported session: the operator's commands and other facts that its captures do not contain."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ _FILE_MAX_BYTES = 8 << 20  # every run of doubtful captures takes some 20
 
 
 class DoubtfulCaptures(BaseModel):
-    """Which captures of a link's log are of doubtful time: logs cannot say it.
+    """Captures of doubtful time in a link's log, which cannot mark them itself.
 
     Attributes:
-        captures: how many the log has in all, so that another one is noticed.
-        runs: the first and the last of each run, counted from 0 in the order of the log.
+        captures: number of captures in the whole log, so that a different log is noticed.
+        runs: number of the first and the last capture of each run, from 0 in the order of the log.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -34,11 +34,11 @@ class DoubtfulCaptures(BaseModel):
 
 
 class DeviceState(BaseModel):
-    """The last word of a device on its own state before the logs begin.
+    """The last report of a device on its own state before the logs begin.
 
     Attributes:
-        device, kind, text, code: as of its event.
-        utc_ns: when, on the time of the logs.
+        device, kind, text, code: as in its event.
+        utc_ns: instant of the event, on the time axis of the logs.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -51,18 +51,18 @@ class DeviceState(BaseModel):
 
 
 class SessionFile(BaseModel):
-    """An exported session, beside its captures.
+    """An exported session without its captures. All times are on the time axis of the logs.
 
     Attributes:
-        prism, kind: as the session was started.
-        since_utc_ns, until_utc_ns: from when to when it took fixes, on the time of its captures' logs.
-        prism_confirmed_utc_ns: when an operator said that the station was on the prism, on the same time.
-        prism_turned_utc_ns: when something turned the station to the prism, on the same time.
-        control_points: name -> place, mm, of those of its set-up: fixes there are not of the prism.
-        doubtful: link -> its captures of doubtful time; links without any are not there.
-        can_channels: CAN link -> its channel number, from 1, in logs that have no names; empty in files of earlier
+        prism, kind: prism and kind with which the session was started.
+        since_utc_ns, until_utc_ns: start and end of the session.
+        prism_confirmed_utc_ns: when an operator confirmed that the station was on the prism.
+        prism_turned_utc_ns: when a program turned the station to the prism.
+        control_points: name -> place, mm, of the control points of its set-up; fixes there are not of the prism.
+        doubtful: link -> its captures of doubtful time; links without such captures are left out.
+        can_channels: CAN link -> its channel number, from 1, in logs without channel names; empty in files of earlier
             versions.
-        device_states: what devices had told of their state before the logs begin, oldest first.
+        device_states: last reports of devices on their state before the logs begin, oldest first.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -80,10 +80,10 @@ class SessionFile(BaseModel):
 
 
 def read_session_file(path: Path) -> SessionFile:
-    """Read the file that `rigcal session export` wrote of a session.
+    """Read the session file that `rigcal session export` wrote.
 
     Raises:
-        DescriptionError: it cannot be read, or is no such file.
+        DescriptionError: the file cannot be read, or is not a session file.
     """
     try:
         return SessionFile.model_validate_json(read_whole(path, _FILE_MAX_BYTES))
@@ -93,5 +93,5 @@ def read_session_file(path: Path) -> SessionFile:
         first = error.errors()[0]
         where = ".".join(map(str, first["loc"]))
         raise DescriptionError(
-            str(path), f"is no exported session: {where}{': ' * bool(where)}{first['msg']}"
+            str(path), f"is not the file of an exported session: {where}{': ' * bool(where)}{first['msg']}"
         ) from error

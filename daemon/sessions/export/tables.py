@@ -23,7 +23,7 @@ from daemon.store.reader import Reader
 Row = Mapping[str, Any]
 Tables = Mapping[str, Iterable[Row]]
 
-_BATCH = 50_000  # rows that are held at once
+_BATCH = 50_000  # rows held in memory at once
 _TEXT = {"prism", *LABEL_COLUMNS, "time", "joint", "status", "station", "lock", "reason"}  # columns without numbers
 _WHOLE = {"id", "boot_id", "monotonic_ns"}
 
@@ -31,13 +31,14 @@ _WHOLE = {"id", "boot_id", "monotonic_ns"}
 def export_tables(store: Path, session_id: str, out: Path, form: str) -> list[Path]:
     """Write a session's observations, joint readings and fixes.
 
-    Observations have the columns of the observations CSV, and are those that calibration may use; readings and fixes
-    have those of the views `v_joints` and `v_fixes` (docs/reference/schema.md), and are all from start to end.
+    Observations have the columns of the observations CSV; only those that calibration may use are written. Readings and
+    fixes have the columns of the views `v_joints` and `v_fixes` (docs/reference/schema.md); all from the session's
+    start to its end are written.
 
     Args:
         store: the database.
         session_id: a session that has ended.
-        out: directory, made if need be.
+        out: directory, created if needed.
         form: a key of TABLE_FORMATS.
 
     Returns:
@@ -45,8 +46,8 @@ def export_tables(store: Path, session_id: str, out: Path, form: str) -> list[Pa
         `<session>.mat` with three structures. A table without rows is left out.
 
     Raises:
-        CommandError: no such session, it is still open or not decoded, or the library that writes the format is not
-            installed.
+        CommandError: there is no such session, it is still open or not decoded, or the library that writes the format
+            is not installed.
         StoreError: there is no store, or it cannot be read.
     """
     with Reader(store) as reader:
@@ -62,7 +63,7 @@ def export_tables(store: Path, session_id: str, out: Path, form: str) -> list[Pa
 
 
 def _observations(reader: Reader, rig: Rig, session_id: str) -> Iterator[Row]:
-    """Yield the rows of the observations CSV, with numbers as such."""
+    """Yield the rows of the observations CSV, with numbers converted to float."""
     text = sessions_csv(reader, rig, [session_id]).decode()
     for row in csv.DictReader(io.StringIO(text)):
         yield {name: _cell(name, value) for name, value in row.items()}
@@ -114,7 +115,7 @@ def _write_parquet(tables: Tables, base: Path) -> list[Path]:
 
 
 def _arrow_type(pa: Any, column: str) -> Any:
-    """Return a column's type by its name: one batch may have no value of it."""
+    """Return a column's type by its name, because a batch may contain no value of it."""
     if column in _TEXT:
         return pa.string()
     return pa.int64() if column in _WHOLE else pa.float64()
@@ -132,7 +133,7 @@ def _write_mat(tables: Tables, base: Path) -> list[Path]:
 
 
 def _arrays(rows: Iterable[Row]) -> dict[str, NDArray[Any]]:
-    """Return the columns of rows: numbers with NaN for what is not there, texts with ""."""
+    """Return the columns of rows; missing numbers are NaN, missing texts are ""."""
     parts: dict[str, list[NDArray[Any]]] = {}
     for batch in _batches(rows):
         for column in batch[0]:

@@ -1,1 +1,1 @@
-"""The prism that is meant: which fixes are of it, from their own course, the boom's standstills and the joints."""
+"""The session's prism: which fixes are of it, judged by the fixes' motion, the boom's standstills and the joints."""

@@ -1,9 +1,9 @@
-"""Evidence of the joints that a station is on the prism that is meant: the rigid fit of its targets.
+"""Evidence from the joints that a station is on the session's prism: the rigid fit of its targets.
 
 Fixes between two instants at which a station may have changed its target are of one target: a stretch. Each stretch is
-held against the others of the session and against the poses that earlier sessions of the set-up have left, by
-`calibration.identification.prism_identity`: a base that stands still places all prisms by one rigid transform. What
-cannot be compared with anything yet is kept, and judged again whenever there is more.
+compared with the session's other stretches and with the poses of earlier sessions in the set-up, by
+`calibration.identification.prism_identity`: while the base stands still, one rigid transform places all prisms. A
+stretch that cannot be compared with anything yet is kept, and judged again whenever there are more fixes.
 """
 
 from __future__ import annotations
@@ -33,34 +33,34 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-RETRY_S = 30.0  # after the mathematics could not be loaded
-LATE_S = 0.25  # by so much the instants of fixes and of joints may differ while the boom moves
-MOST_SLACK_MM = 500.0  # a fix that may be further off for the motion tells nothing
-MOVED_MM = 100.0  # the boom, before another fix of a stretch is looked at
-MOST_OF_STRETCH = 60  # fixes that are looked at
-MOST_OF_GROUP = 10  # others that one is compared with
-MOST_STRETCHES = 40  # that are kept to compare others with
-STRONG = 3  # targets that determine where the base stands
-CLEARLY = 2.0  # another name must fit so many times better, or worse
+RETRY_S = 30.0  # after the mathematical code could not be loaded
+LATE_S = 0.25  # largest difference between the instants of a fix and of its joints while the boom moves
+MOST_SLACK_MM = 500.0  # a fix whose place is less certain than this, because of the motion, is not used
+MOVED_MM = 100.0  # motion of the boom before another fix of a stretch is used
+MOST_OF_STRETCH = 60  # largest number of fixes used of a stretch
+MOST_OF_GROUP = 10  # largest number of fixes of a group in one comparison
+MOST_STRETCHES = 40  # largest number of stretches kept for comparison
+STRONG = 3  # number of targets that determine where the base stands
+CLEARLY = 2.0  # factor by which a different prism must fit better, or worse
 
 
 class Verdict(Enum):
     """Verdict of the joints on a stretch."""
 
-    OPEN = "nothing yet"
-    NAMED = "the prism that is meant"
+    OPEN = "undecided"
+    NAMED = "the session's prism"
     OTHER = "another target"
 
 
 @dataclass(frozen=True)
 class Sighting:
-    """A target's place with the machine's joints.
+    """A target's place with the machine's joints at that instant.
 
     Attributes:
-        prism: that it is taken for.
+        prism: prism that the target is taken for.
         joints: readings in the rig's order, deg or mm.
-        place_mm: in the station's frame.
-        slack_mm: by how far it may be off since the boom moved.
+        place_mm: place in the station's frame.
+        slack_mm: largest error of the place that the motion of the boom may cause.
     """
 
     prism: str
@@ -74,13 +74,13 @@ class Stretch:
     """Fixes of one target.
 
     Attributes:
-        station: whose.
-        since: the first of them.
-        is_believed: an operator says that they are of the prism that is meant; the joints are not asked.
-        sightings: those that are looked at.
-        instants_ns: of its observations that calibration may use as far as the target goes, monotonic.
-        verdict: so far.
-        is_sure: there was enough to compare with.
+        station: station that measured them.
+        since: instant of the first fix.
+        is_believed: an operator has confirmed that they are of the session's prism; the joints are not consulted.
+        sightings: sightings that are used for comparison.
+        instants_ns: monotonic instants of its observations that calibration may use as far as the target is concerned.
+        verdict: verdict so far.
+        is_sure: whether there were enough targets to compare with.
     """
 
     station: str
@@ -97,9 +97,9 @@ class Finding:
     """A verdict that has changed.
 
     Attributes:
-        stretch: on which.
-        distance_m: how far its target lies from where the joints put the prism that is meant.
-        is_like: which other prism, or `a reflector that stands`, it fits instead; "" where it fits none.
+        stretch: the stretch.
+        distance_m: distance of its target from where the joints place the session's prism.
+        is_like: other prism, or `a stationary reflector`, that it fits instead; "" where it fits none.
     """
 
     stretch: Stretch
@@ -108,13 +108,13 @@ class Finding:
 
 
 class IdentityLoader:
-    """The mathematics, imported beside everything else when a session first needs it; again where that fails.
+    """Loads the mathematical code in a thread when a session first needs it, and retries on failure.
 
     Args:
         rig: the machine.
 
     Attributes:
-        trouble: why it could not be loaded the last time, a clause; None where nothing is wrong.
+        trouble: why the last attempt to load failed, a clause; None if it did not.
     """
 
     def __init__(self, rig: Rig) -> None:
@@ -124,11 +124,11 @@ class IdentityLoader:
         self._loaded: PrismIdentity | None = None
 
     def now(self) -> PrismIdentity | None:
-        """Return what tells prisms apart; None while it is being loaded."""
+        """Return the comparison of prisms; None until it is loaded."""
         return self._loaded
 
     def motion(self) -> TargetMotion | None:
-        """Return what compares fixes with the ones before, anew; None while it is being loaded."""
+        """Return a new comparison of successive fixes; None until the code is loaded."""
         if self._loaded is None:
             return None
         from daemon.sessions.prisms.motion import TargetMotion
@@ -136,12 +136,12 @@ class IdentityLoader:
         return TargetMotion(self._rig)
 
     def start(self, wait_s: float = 0.0) -> None:
-        """Begin to load it, and wait for it at most so long."""
+        """Start loading, and wait for its end for at most `wait_s` seconds."""
         if self._thread is None:
             thread = threading.Thread(target=self._run, name="prism-identity", daemon=True)
             try:
                 thread.start()
-            except RuntimeError as error:  # the system has no thread to give; the next session asks again
+            except RuntimeError as error:  # the system cannot start a thread; the next session tries again
                 self._fail(error)
                 return
             self._thread = thread
@@ -153,13 +153,13 @@ class IdentityLoader:
             try:
                 self._loaded = self._load()
                 self.trouble = None
-            except Exception as error:  # noqa: BLE001 - what the computer lacks may be there the next time
+            except Exception as error:  # noqa: BLE001 - what the computer lacks may be available the next time
                 self._fail(error)
                 time.sleep(RETRY_S)
 
     def _load(self) -> PrismIdentity:
         prepare()
-        import daemon.sessions.prisms.motion  # noqa: F401  # so that nobody waits for it later
+        import daemon.sessions.prisms.motion  # noqa: F401  # so that no later call waits for it
         from calibration.identification.prism_identity import PrismIdentity
 
         made = PrismIdentity(self._rig)
@@ -171,7 +171,7 @@ class IdentityLoader:
         trouble = f"{type(error).__name__}: {error}"
         if trouble != self.trouble:
             log.error(
-                "what the joints say of prisms cannot be asked for now; new locks are judged by distance alone",
+                "prisms cannot be checked against the joints at present; new locks are judged by distance alone",
                 exc_info=error,
             )
         self.trouble = trouble
@@ -182,10 +182,10 @@ class PrismEvidence:
 
     Args:
         rig: the machine.
-        prism: that the session is of.
-        loader: of the mathematics.
-        earlier: groups of sightings that are relied on as long as they fit each other, the oldest first: of each
-            earlier session of the set-up, and of this one before the daemon ended.
+        prism: the session's prism.
+        loader: loader of the mathematical code.
+        earlier: groups of sightings that are relied on as long as they fit each other, oldest first: one of each
+            earlier session in the set-up, and one of this session from before a restart of the daemon.
     """
 
     def __init__(
@@ -199,18 +199,25 @@ class PrismEvidence:
         self._motion: TargetMotion | None = None
 
     def jump_m(self, joined: JoinedFix, place_mm: Place, turn: Turn, *, is_suspected: bool) -> float | None:
-        """Take a fix, in order, moving or not: how far its target jumped, m; None where the joints explain it."""
+        """Add a fix, in order, moving or not, and return how far its target jumped, m; None if the joints explain it.
+
+        Args:
+            joined: the fix with its joints.
+            place_mm: place of its target in the station's frame.
+            turn: the station's last turn.
+            is_suspected: the target may already be another prism.
+        """
         self._motion = self._motion or self._loader.motion()
         if self._motion is None:
             return None
         return self._motion.jump_m(joined, place_mm, self._prism, turn.at, is_sure=not is_suspected)
 
     def stray_m(self, station: str) -> float | None:
-        """Return how far the target of the fix taken last strayed since its turn, m; None where joints explain it."""
+        """Return how far the target of the newest fix has strayed since its turn, m; None if the joints explain it."""
         return None if self._motion is None else self._motion.stray_m(station, self._prism)
 
     def stretch(self, station: str, since: Stamp, is_believed: bool) -> Stretch:
-        """Return the stretch of a station that began then; a new one the first time."""
+        """Return the stretch of a station that began at `since`; create it if there is none."""
         for known in reversed(self._stretches):
             if known.station == station and known.since == since:
                 return known
@@ -222,7 +229,7 @@ class PrismEvidence:
         return made
 
     def take(self, stretch: Stretch, joined: JoinedFix, place_mm: Place) -> list[Finding]:
-        """Take a fix of a stretch; the verdicts that it changes."""
+        """Add a fix to a stretch, and return the verdicts that change."""
         sighting = self._sighting(joined, place_mm)
         is_new = sighting is not None and self._tells(stretch, sighting)
         if is_new and sighting is not None:
@@ -252,14 +259,14 @@ class PrismEvidence:
         return Sighting(self._prism, tuple(joined.values[joint.column] for joint in joints), place_mm, slack_mm)
 
     def _tells(self, stretch: Stretch, sighting: Sighting) -> bool:
-        """True if the boom has moved since the stretch was last looked at."""
+        """Return True if the boom has moved since the stretch's last sighting."""
         if not stretch.sightings:
             return True
         changes = zip(self._rig.joints, sighting.joints, stretch.sightings[-1].joints, strict=True)
         return sum(abs(now - then) * self._travel_mm[joint.column] for joint, now, then in changes) > MOVED_MM
 
     def _judge(self, identity: PrismIdentity, stretches: Sequence[Stretch]) -> list[Finding]:
-        """Judge stretches, and all others anew when one of their verdicts has changed."""
+        """Judge stretches; if a verdict changes, judge all stretches again."""
         found: list[Finding] = []
         asked = list(stretches)
         for _ in range(3):
@@ -274,10 +281,10 @@ class PrismEvidence:
         return list({id(finding.stretch): finding for finding in found}.values())
 
     def _judge_as_one(self, identity: PrismIdentity, judged: Sequence[Stretch]) -> list[Finding]:
-        """Judge one stretch, or several that may be of one target; the verdicts that change.
+        """Judge one stretch, or several that may be of one target, and return the verdicts that change.
 
-        What is compared with something that determines where the base stands, or is enough for that itself, is judged
-        for sure. Several stretches are judged together only so: each by itself was too little.
+        The verdict is sure if either the targets compared with or the stretches' own targets determine where the base
+        stands. Several stretches, each too short by itself, are judged together only if the verdict is sure.
         """
         sightings = [one for stretch in judged for one in _some(stretch.sightings)]
         if any(stretch.is_believed for stretch in judged) or not sightings:
@@ -293,9 +300,9 @@ class PrismEvidence:
                 misfits, verdict, is_sure = alone, by_itself, True
         if len(judged) > 1 and not is_sure:
             return []
-        if len(judged) > 1 and verdict is Verdict.NAMED:  # most are the prism; each that is must fit them by itself
+        if len(judged) > 1 and verdict is Verdict.NAMED:  # most are of the prism; each must also fit by itself
             return [finding for stretch in judged for finding in self._judge_as_one(identity, [stretch])]
-        # Where nothing fits, what was found before stays
+        # Where nothing fits, the earlier verdict stays
         ends_doubt = len(judged) == 1 and judged[0].verdict is Verdict.OTHER and misfits.prism[self._index()] <= 1.0
         if verdict is Verdict.OPEN and not ends_doubt:
             return []
@@ -313,14 +320,14 @@ class PrismEvidence:
         return Verdict.OTHER if fits_another or relied >= STRONG else Verdict.OPEN
 
     def _best_other(self, misfits: Misfits, own: int) -> tuple[float, str]:
-        """Return the misfit and the name of the best of all other names."""
+        """Return the misfit and the name of the best-fitting other target."""
         named = [
             (float(misfit), f"prism {name}")
             for name, misfit in zip(self._rig.prism_names, misfits.prism, strict=True)
             if name != self._prism
         ]
         if own > 1:
-            named.append((misfits.standing, "a reflector that stands still"))
+            named.append((misfits.standing, "a stationary reflector"))
         return min(named, default=(np.inf, ""))
 
     def _likeness(self, misfits: Misfits, own: int) -> str:
@@ -328,13 +335,13 @@ class PrismEvidence:
         return name if misfit <= 1.0 else ""
 
     def _relied_on(self, identity: PrismIdentity, judged: Sequence[Stretch]) -> Targets:
-        """Return what stretches are compared with: groups that fit each other; those that fit worst are left out."""
+        """Return the targets to compare with: groups that fit each other, without those that fit worst."""
         groups = [_some(group) for group in self._earlier]
         is_later = False
         for stretch in self._stretches:
             if stretch in judged:
                 is_later = True
-            # An operator's word counts from then on, never backwards
+            # An operator's confirmation applies from its instant on, never to earlier fixes
             elif stretch.verdict is not Verdict.OTHER and not (is_later and stretch.is_believed):
                 groups.append(_some(stretch.sightings))
         groups = [group for group in groups if group]
@@ -352,12 +359,17 @@ class PrismEvidence:
 
 
 def _some(sightings: Sequence[Sighting]) -> Sequence[Sighting]:
-    """Return a few of a stretch's sightings, from its whole length."""
+    """Return a few of a stretch's sightings, spread over its whole length."""
     return sightings[:: math.ceil(len(sightings) / MOST_OF_GROUP) or 1]
 
 
 def sightings_of(rig: Rig, rows: Sequence[tuple[str, Mapping[str, float], Place]]) -> list[Sighting]:
-    """Return sightings from stored observations: prism, values by column, place in mm; those that lack a joint, not."""
+    """Return sightings from stored observations; rows with an unknown prism or a missing joint are skipped.
+
+    Args:
+        rig: the machine.
+        rows: prism, value by column, and place in mm of each observation.
+    """
     columns = [joint.column for joint in rig.joints]
     return [
         Sighting(prism, tuple(values[column] for column in columns), place_mm)

@@ -1,7 +1,8 @@
-"""Guard of the prism that is meant: a pure state machine over one station's fixes in a session.
+"""Guard of the session's prism: a pure state machine over one station's fixes in a session.
 
-A total station follows whatever reflector it finds, and its fixes look as good as before. Which prism is meant only an
-operator knows: who starts a session names it, and the station is believed to be on it then.
+A total station follows any reflector that it finds, and fixes of a wrong one look as good as before. Only an operator
+knows which prism the station is on: the operator who starts a session names the prism, and the station is assumed to be
+on it at that time.
 """
 
 from __future__ import annotations
@@ -19,25 +20,26 @@ from drivers.readings import DeviceEvent, EventKind, Fix, LockState, Status
 from drivers.stations.config import StationConfig
 from drivers.stations.survey import position_mm
 
-CONFIRM = "`rigcal session confirm-prism` says that it is the prism that is meant"
-USUAL_OF = 5  # intervals, whose median no single late fix and no pause changes
-USUAL_NS = NS_PER_S  # at most, and while fewer than three are known
-PAUSE_NS = 2 * NS_PER_S  # a station that is aimed by hand may have been aimed anew in so long a time without a fix
-TURN_NS = 10 * NS_PER_S  # a jump so long after the station was told to turn is no turn
+CONFIRM = "`rigcal session confirm-prism`"
+UNTIL = f"until the station is back on the session's prism, or until an operator confirms the prism with {CONFIRM}"
+USUAL_OF = 5  # number of intervals; their median is not changed by a single late fix or pause
+USUAL_NS = NS_PER_S  # largest usual interval, and the one assumed while fewer than three are known
+PAUSE_NS = 2 * NS_PER_S  # during a pause of this length a station aimed by hand may have been aimed at another target
+TURN_NS = 10 * NS_PER_S  # a jump this long after the station was told to turn is not the turn
 
 _Point = tuple[float, float, float]
 
 
 @dataclass(frozen=True, slots=True)
 class MotionLimit:
-    """Limit of the motion of a prism, and how a station follows it.
+    """Limits of the motion of a prism, and how a station follows it.
 
     Attributes:
-        max_speed_m_s: faster than this no prism moves. The default is the bound of a field-proven program, 1 m
-            between polls 0.2 s apart.
+        max_speed_m_s: highest speed of a prism. The default is the bound of a field-proven program, 1 m between polls
+            0.2 s apart.
         slack_m: added to every distance, for noise and for jitter of the fixes' instants.
-        relock_within_m: a new lock further than this from where the prism was lost may be on another one.
-        tracks: the station follows a prism by itself although its records do not say so.
+        relock_within_m: a new lock further than this from where the prism was lost may be on another prism.
+        tracks: the station follows a prism by itself although its records do not show it.
     """
 
     max_speed_m_s: float = 5.0
@@ -47,21 +49,21 @@ class MotionLimit:
 
     @classmethod
     def of_station(cls, config: StationConfig) -> MotionLimit:
-        """The limit that a station's configuration gives."""
+        """Return the limits given by a station's configuration."""
         return cls(config.max_speed_m_s, config.jump_slack_m, config.relock_within_m, config.tracks_silently)
 
     def reach_m(self, within_ns: float) -> float:
-        """Return the largest distance of two fixes of one prism that were measured within so long a time."""
+        """Return the largest distance between two fixes of one prism measured `within_ns` of each other."""
         return self.slack_m + self.max_speed_m_s * max(0.0, within_ns) / NS_PER_S
 
 
 @dataclass(frozen=True, slots=True)
-class Word:
-    """The word of an operator or program that a station is on the prism, which fixes cannot tell.
+class OperatorConfirmation:
+    """Confirmation by an operator or a program that a station is on the session's prism; fixes alone cannot show it.
 
     Attributes:
-        at: from then on the station is on the prism that is meant.
-        is_turning: it was told to turn to it, and may still measure what it was on before.
+        at: instant from which the station is on the session's prism.
+        is_turning: the station was told to turn to the prism, and may still measure its earlier target.
     """
 
     at: Stamp
@@ -73,11 +75,11 @@ class Suspicion:
     """A stretch of fixes that may be of another prism.
 
     Attributes:
-        station: whose fixes.
-        since: the first of them.
-        distance_m: how far from the place of the prism that is meant the station's target was when it last jumped.
-        until: fixes from then on count again; None while it lasts.
-        evidence: what tells that it may be another prism, a clause; a jump by default.
+        station: station that measured the fixes.
+        since: instant of the first of them.
+        distance_m: distance of the station's target from the place of the session's prism at the target's last jump.
+        until: instant from which fixes are used again; None while the suspicion lasts.
+        evidence: why it may be another prism, a clause; a jump by default.
     """
 
     station: str
@@ -88,23 +90,23 @@ class Suspicion:
 
     @property
     def reason(self) -> str:
-        """Why calibration must not use its fixes."""
+        """Reason why calibration must not use its fixes."""
         evidence = self.evidence or f"the station's target jumped by {self.distance_m:.2f} m"
         return f"perhaps another prism: {evidence}"
 
     @property
     def remedy(self) -> str:
         """Instruction to the operator."""
-        return f"aim {self.station} at the prism again; where it is on it already, {CONFIRM}"
+        return f"aim {self.station} at the session's prism; if it is already on that prism, confirm it with {CONFIRM}"
 
 
 @dataclass(frozen=True, slots=True)
 class Turn:
-    """An instant from which on the station may have another target.
+    """An instant from which the station may have a new target.
 
     Attributes:
-        at: of the first fix since then.
-        is_believed: an operator has said before it that the station is on the prism that is meant.
+        at: instant of the first fix since then.
+        is_believed: an operator confirmed just before it that the station is on the session's prism.
     """
 
     at: Stamp
@@ -112,86 +114,95 @@ class Turn:
 
 
 @dataclass(frozen=True, slots=True)
-class _Seen:
+class _FixPlace:
+    """Where and when a fix was measured, and whether by circles or by the instrument's own coordinates."""
+
     point: _Point
     stamp: Stamp
     has_circles: bool
 
-    def distance_m(self, other: _Seen) -> float:
+    def distance_m(self, other: _FixPlace) -> float:
         return math.dist(self.point, other.point) / 1000
 
 
 @dataclass
 class PrismGuard:
-    """Suspects the fixes of a prism that the station may have changed to.
+    """Suspects fixes that may be of a prism other than the session's.
 
-    A suspicion begins with two successive fixes that lie further apart than motion can explain, and with a new lock
-    far from where the prism was lost: a search finds any prism. However long the new target is followed, it ends only
+    A suspicion begins with two successive fixes that lie further apart than motion can explain, or with a new lock far
+    from where the prism was lost, because a search finds any prism. However long the new target is followed, it ends
+    only
 
-    - by a word: an operator says that the station is on the prism that is meant, or it was told to turn to it;
-    - when the evidence goes: the target jumps once more, or is locked anew, near the last place of the prism.
+    - by a confirmation: an operator confirms that the station is on the session's prism, or it was told to turn to it;
+    - by new evidence: the target jumps again, or is locked again, near the last place of the prism.
 
-    A station that is aimed by hand (single shots, tens of seconds apart) is aimed anew for every pose; between such
-    shots motion can come far, and only what is faster is suspected. Positions by circles and by the instrument's own
-    coordinates have different origins and are never compared. The first fix after a word is believed.
+    A station that is aimed by hand (single shots, tens of seconds apart) is aimed again for every pose. Between such
+    shots a prism can move far, and only faster motion is suspected. Positions from circles and from the instrument's
+    own coordinates have different origins and are never compared. The first fix after a confirmation is believed.
 
-    Stamps say when fixes were read: one that was read late seems to be followed too soon. So motion between two
-    successive fixes has no less time than fixes usually lie apart.
+    Stamps give when fixes were read. After a fix that was read late, the next one appears too soon. Therefore two
+    successive fixes are assumed to be at least the usual interval apart.
 
     Attributes:
-        station: its name.
-        limit: what motion can do.
-        words: of the session, oldest first; grows meanwhile.
-        order: of instants.
-        suspicions: all so far; only the last one can still last.
-        turns: all so far, in order; between two of them the station follows one target.
+        station: name of the station.
+        limit: limits of the prism's motion.
+        confirmations: confirmations in the session, oldest first; the list grows during the session.
+        order: order of instants.
+        suspicions: all suspicions so far; only the last one can still last.
+        turns: all turns so far, in order; between two turns the station follows one target.
     """
 
     station: str
     limit: MotionLimit
-    words: Sequence[Word]
+    confirmations: Sequence[OperatorConfirmation]
     order: Order
     suspicions: list[Suspicion] = field(default_factory=list)
     turns: list[Turn] = field(default_factory=list)
     _is_believed: bool = False
-    _heeded: int = 0  # words
-    _good: _Seen | None = None  # the last fix that was surely of the prism
-    _near_m: float = 0.0  # so near to its place a target that has jumped again is the prism
-    _last: _Seen | None = None
-    _intervals_ns: deque[int] = field(default_factory=partial(deque, maxlen=USUAL_OF))  # between fixes, lately
+    _heeded: int = 0  # number of confirmations applied
+    _good: _FixPlace | None = None  # the last fix that was surely of the prism
+    _near_m: float = 0.0  # a target that jumps to within this distance of `_good` is the prism again
+    _last: _FixPlace | None = None
+    _intervals_ns: deque[int] = field(default_factory=partial(deque, maxlen=USUAL_OF))  # between the last fixes
     _is_new_lock: bool = False
     _is_turning: bool = False
     _turning_until: Stamp | None = None
-    _before_turn: _Seen | None = None  # the last fix before the station was told to turn
+    _before_turn: _FixPlace | None = None  # the last fix before the station was told to turn
 
     @property
     def suspicion(self) -> Suspicion | None:
-        """The one that lasts; None where the newest word has ended it."""
+        """The suspicion that lasts; None without one, or where the newest confirmation has ended it."""
         lasting = self._lasting()
-        return lasting if lasting is not None and len(self.words) == self._heeded else None
+        return lasting if lasting is not None and len(self.confirmations) == self._heeded else None
 
     def doubt(self, stamp: Stamp) -> Suspicion | None:
-        """The suspicion under which a fix of that instant falls."""
+        """Return the suspicion that applies to a fix of that instant; None if there is none."""
         return next((s for s in self.suspicions if lies_within(self.order, stamp, s.since, s.until)), None)
 
     def turn(self, stamp: Stamp) -> Turn | None:
-        """The last turn before a fix of that instant; None where it was not seen."""
+        """Return the last turn before a fix of that instant; None if there is none."""
         number = bisect_right(self.turns, self.order(stamp), key=lambda turn: self.order(turn.at))
         return self.turns[number - 1] if number else None
 
     def suspect(self, turn: Turn, distance_m: float, evidence: str) -> Suspicion:
-        """Suspect the fixes from a turn to the next one, or to the end of a suspicion that lasts."""
+        """Suspect the fixes from a turn to the next turn; without a next turn the suspicion lasts.
+
+        Args:
+            turn: the turn.
+            distance_m: distance of the target from the place of the session's prism.
+            evidence: why it may be another prism, a clause.
+        """
         self.clear(turn)
         until = self._next(turn)
         made = Suspicion(self.station, turn.at, distance_m, until, evidence)
         self.suspicions.append(made)
         self.suspicions.sort(key=lambda suspicion: self.order(suspicion.since))
         if until is None:
-            self._good = None  # where the prism is nobody knows
+            self._good = None  # the place of the prism is unknown
         return made
 
     def clear(self, turn: Turn) -> None:
-        """Suspect the fixes from a turn to the next one no more: they are of the prism that is meant."""
+        """Remove suspicions of the fixes from a turn to the next turn: they are of the session's prism."""
         begin, until = turn.at, self._next(turn)
         left: list[Suspicion] = []
         for suspicion in self.suspicions:
@@ -208,38 +219,40 @@ class PrismGuard:
         return other if until is None else min(until, other, key=self.order)
 
     def _next(self, turn: Turn) -> Stamp | None:
-        """When the station next turned; None before it has."""
+        """Return when the station next turned; None if it has not."""
         number = bisect_right(self.turns, self.order(turn.at), key=lambda one: self.order(one.at))
         return self.turns[number].at if number < len(self.turns) else None
 
     def may_turn(self, at: Stamp) -> bool:
-        """Return True if the station was told to turn before that instant, and nothing shows yet that it has."""
-        last = next((word for word in reversed(self.words) if self.order(word.at) <= self.order(at)), None)
+        """Return True if the station was told to turn shortly before that instant, and no fix shows that it has."""
+        last = next((one for one in reversed(self.confirmations) if self.order(one.at) <= self.order(at)), None)
         if last is None or not last.is_turning or not lies_within(self.order, at, None, last.at.shifted(TURN_NS)):
             return False
         return sum(lies_within(self.order, turn.at, last.at, at) for turn in self.turns) <= 1
 
     def part(self, at: Stamp) -> Turn:
-        """Take a turn that fixes alone did not show: what tells of it is known later than they are."""
+        """Add a turn that the fixes alone did not show; its evidence is known only after the fixes."""
         made = Turn(at)
         self.turns.append(made)
         self.turns.sort(key=lambda turn: self.order(turn.at))
         return made
 
     def look_away(self) -> None:
-        """The station was on something else on purpose: its next fix is compared as after a new lock."""
+        """Note that the station was deliberately on another target: its next fix is compared as after a new lock."""
         self._is_new_lock = True
 
     def see(self, fix: Fix) -> DeviceEvent | None:
-        """Take a fix, in order; what there is to tell an operator."""
-        while self._heeded < len(self.words) and self.order(fix.stamp) >= self.order(self.words[self._heeded].at):
-            self._heed(self.words[self._heeded])
+        """Add a fix, in order, and return an event for the operator if there is one."""
+        while self._heeded < len(self.confirmations) and self.order(fix.stamp) >= self.order(
+            self.confirmations[self._heeded].at
+        ):
+            self._heed(self.confirmations[self._heeded])
         if fix.status is Status.NOT_AVAILABLE and (fix.lock is not LockState.UNKNOWN or self.limit.tracks):
             self._is_new_lock = True
         point = position_mm(fix)
-        if point is None or fix.status is Status.TIME_DOUBTFUL:  # how fast it came there is not known
+        if point is None or fix.status is Status.TIME_DOUBTFUL:  # its speed is not known
             return None
-        seen = _Seen(point, fix.stamp, fix.slope_distance_m is not None)
+        seen = _FixPlace(point, fix.stamp, fix.slope_distance_m is not None)
         is_new_lock, self._is_new_lock = self._is_new_lock, False
         last, self._last = self._last, seen
         if last is not None and last.stamp.boot_id == seen.stamp.boot_id:
@@ -248,7 +261,7 @@ class PrismGuard:
             self._is_turning = False
         before, self._before_turn = self._before_turn, None
         if before is not None and self._has_jumped(before, seen):
-            self._is_turning = False  # it had turned already: a lock that is lost from now on is no turn
+            self._is_turning = False  # it had already turned: a later loss of lock is not the turn
         if is_new_lock or last is None or self._has_turned(last, seen):
             self.turns.append(Turn(seen.stamp, self._is_believed))
             self._is_believed = False
@@ -263,18 +276,18 @@ class PrismGuard:
             return None
         return self._judge(seen, good, is_new_lock)
 
-    def _heed(self, word: Word) -> None:
+    def _heed(self, confirmation: OperatorConfirmation) -> None:
         self._heeded += 1
-        self._end_suspicion(word.at)
-        self._before_turn = self._last if word.is_turning else None
+        self._end_suspicion(confirmation.at)
+        self._before_turn = self._last if confirmation.is_turning else None
         self._good = self._last = None
-        if not word.is_turning:  # a station that turns goes on measuring as before
+        if not confirmation.is_turning:  # a station that turns continues to measure as before
             self._intervals_ns.clear()
-        self._is_new_lock, self._is_turning = False, word.is_turning
-        self._turning_until = word.at.shifted(TURN_NS)
-        self._is_believed = not word.is_turning
+        self._is_new_lock, self._is_turning = False, confirmation.is_turning
+        self._turning_until = confirmation.at.shifted(TURN_NS)
+        self._is_believed = not confirmation.is_turning
 
-    def _judge(self, seen: _Seen, good: _Seen, is_new_lock: bool) -> DeviceEvent | None:
+    def _judge(self, seen: _FixPlace, good: _FixPlace, is_new_lock: bool) -> DeviceEvent | None:
         moved_m = good.distance_m(seen)
         explained_m = self._reach_m(good, seen)
         if is_new_lock:
@@ -283,10 +296,10 @@ class PrismGuard:
         if moved_m <= explained_m:
             return None
         if self._is_turning:
-            self._is_turning = False  # that was the turn, of which no record told
+            self._is_turning = False  # that was the turn, although no record showed it
             return None
         self._good = good
-        # Half of the jump, lest two prisms that stand near each other are both the earlier one
+        # At most half of the jump, so that of two prisms near each other only one is taken for the earlier target
         self._near_m = min(self.limit.relock_within_m, moved_m / 2)
         self.suspicions.append(Suspicion(self.station, seen.stamp, moved_m))
         seconds = seen.stamp.since(good.stamp) / NS_PER_S
@@ -294,12 +307,11 @@ class PrismGuard:
         return self._event(
             seen,
             EventKind.PRISM_JUMP,
-            f"{how} {moved_m:.2f} m away after {seconds:.2f} s: perhaps another prism; its fixes do not count until "
-            f"the station is back, or until {CONFIRM}",
+            f"{how} {moved_m:.2f} m away after {seconds:.2f} s: perhaps another prism; its fixes are not used {UNTIL}",
         )
 
     def _judge_suspected(
-        self, suspicion: Suspicion, seen: _Seen, last: _Seen | None, is_new_lock: bool
+        self, suspicion: Suspicion, seen: _FixPlace, last: _FixPlace | None, is_new_lock: bool
     ) -> DeviceEvent | None:
         good = self._good
         if good is None or last is None or good.has_circles != seen.has_circles:
@@ -312,24 +324,25 @@ class PrismGuard:
         if back_m <= self._near_m:
             self._end_suspicion(seen.stamp)
             self._good = seen
-            return self._event(seen, EventKind.LOCK_ACQUIRED, "the target is the earlier prism again; its fixes count")
+            text = "the target is the earlier prism again; its fixes are used again"
+            return self._event(seen, EventKind.LOCK_ACQUIRED, text)
         self.suspicions[-1] = replace(suspicion, distance_m=back_m)
         if not (is_new_lock or has_jumped):
             return None
         how = "locked again" if is_new_lock else "the target jumped again"
-        text = f"{how} {back_m:.2f} m from the prism: perhaps another one; its fixes still do not count"
+        text = f"{how} {back_m:.2f} m from the prism: perhaps another prism; its fixes are still not used"
         return self._event(seen, EventKind.PRISM_JUMP, text)
 
-    def _has_turned(self, last: _Seen, seen: _Seen) -> bool:
-        """True if a fix may be of another target than the one before although no lock was lost."""
+    def _has_turned(self, last: _FixPlace, seen: _FixPlace) -> bool:
+        """Return True if a fix may be of another target than the previous fix although no lock was lost."""
         has_paused = last.has_circles != seen.has_circles or seen.stamp.since(last.stamp) > PAUSE_NS
         return has_paused or self._has_jumped(last, seen)
 
-    def _has_jumped(self, last: _Seen, seen: _Seen) -> bool:
-        """True if a fix is further from the one before than motion can explain."""
+    def _has_jumped(self, last: _FixPlace, seen: _FixPlace) -> bool:
+        """Return True if a fix is further from the previous fix than motion can explain."""
         return last.has_circles == seen.has_circles and last.distance_m(seen) > self._reach_m(last, seen)
 
-    def _reach_m(self, earlier: _Seen, later: _Seen) -> float:
+    def _reach_m(self, earlier: _FixPlace, later: _FixPlace) -> float:
         usual_ns = min(USUAL_NS, median_high(self._intervals_ns)) if len(self._intervals_ns) > 2 else USUAL_NS
         return self.limit.reach_m(max(usual_ns, later.stamp.since(earlier.stamp)))
 
@@ -341,5 +354,5 @@ class PrismGuard:
         if suspicion is not None:
             self.suspicions[-1] = replace(suspicion, until=at)
 
-    def _event(self, seen: _Seen, kind: EventKind, text: str) -> DeviceEvent:
+    def _event(self, seen: _FixPlace, kind: EventKind, text: str) -> DeviceEvent:
         return DeviceEvent(self.station, seen.stamp, kind, text)

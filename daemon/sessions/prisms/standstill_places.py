@@ -1,9 +1,9 @@
 """Places of one standstill: the boom does not move, so fixes of its prism lie at one place.
 
-A station that lost its prism may lock on to another one, or to a reflection, and its fixes look as good as before.
-Where the fixes of a standstill lie at several places, the place with the most fixes is taken for the prism's and the
-fixes of the others are excluded; while two places have equally many, both are. More fixes may turn the decision, and
-so does an operator who confirms the prism: then only the fixes since count.
+A station that lost its prism may lock on to another prism or a reflection, and its fixes look as good as before. Where
+the fixes of a standstill lie at several places, the place with the most fixes is taken for the prism's, and the fixes
+at the others are excluded; while two places have equally many fixes, both are excluded. More fixes may change the
+decision. After an operator confirms the prism, only fixes since then are counted.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from daemon.sessions.station_setups import Place
 # by some tens of mm. Two prisms, or a prism and a reflection, that are nearer to each other than this look like one.
 SAME_PLACE_MM = 100.0
 MOST_PLACES = 100
-ELSEWHERE = "another prism or a reflection"  # how the reason for these exclusions begins
-SETTLED_FIXES = 50_000  # hours; what was decided by then stays
-EVERY_FIX = 64  # until a standstill has that many fixes each of them may turn the decision, later one in total / 64
+ELSEWHERE = "another prism or a reflection"  # the reasons for these exclusions begin with it
+SETTLED_FIXES = 50_000  # hours of fixes; later fixes do not change the decision
+EVERY_FIX = 64  # up to this many fixes the decision is checked with each fix, later after every total / 64 fixes
 
 Exclusions = dict[int, str | None]
-"""Instant of a fix, monotonic ns -> why calibration must not use it, None when it may."""
+"""Instant of a fix, monotonic ns -> why calibration must not use the fix; None if it may."""
 
 
 @dataclass
@@ -32,11 +32,11 @@ class _Place:
     """A place at which fixes of one standstill lie.
 
     Attributes:
-        first_mm: where its first fix lies.
-        latest_mm, joints: its latest fix, and the machine's joints then: a boom that sinks slowly counts as standing.
-        count: how many fixes lie there, since an operator last confirmed the prism.
-        instants_ns: of those fixes whose exclusion may still change.
-        excluded: why these must not be used.
+        first_mm: place of its first fix.
+        latest_mm, joints: place of its latest fix, and the joints then; a boom that sinks slowly counts as standing.
+        count: number of fixes there since an operator last confirmed the prism.
+        instants_ns: instants of the fixes whose exclusion may still change.
+        excluded: why these fixes must not be used.
     """
 
     first_mm: Place
@@ -51,7 +51,7 @@ class StandstillPlaces:
     """The places of the present standstill.
 
     Args:
-        rig: whose joints tell how far a boom that counts as standing has moved.
+        rig: the machine, whose joints show how far a boom that counts as standing has moved.
     """
 
     def __init__(self, rig: Rig) -> None:
@@ -65,17 +65,17 @@ class StandstillPlaces:
     def add(
         self, standstill: Hashable, at_ns: int, place_mm: Place, values: Mapping[str, float], confirmations: int = 0
     ) -> Exclusions:
-        """Take a fix.
+        """Add a fix.
 
         Args:
-            standstill: which one it is of; with another one all begins anew.
-            at_ns: when it was measured, monotonic within the standstill.
-            place_mm: where the prism was.
+            standstill: identifier of the fix's standstill; a new one discards all places.
+            at_ns: when the fix was measured, monotonic within the standstill.
+            place_mm: place of the fix, in the station's frame.
             values: observations CSV column -> number, with the joints at that instant.
-            confirmations: how often an operator had confirmed the prism by then: fixes since the last time decide.
+            confirmations: how often an operator had confirmed the prism by then; fixes since the last time decide.
 
         Returns:
-            The exclusion of this fix, and of earlier ones of the standstill for which it has changed.
+            The exclusion of this fix, and of earlier fixes of the standstill whose exclusion has changed.
         """
         if standstill != self._standstill:
             self._standstill, self._places, self._fixes, self._decided_at = standstill, [], 0, 0
@@ -98,7 +98,7 @@ class StandstillPlaces:
         return changed
 
     def withdraw(self, instants_ns: Collection[int]) -> Exclusions:
-        """Take fixes back that are known to be of another prism; the fixes for which the exclusion has changed."""
+        """Remove fixes that are known to be of another prism, and return the exclusions that change."""
         gone = set(instants_ns)
         for place in self._places:
             kept = [at_ns for at_ns in place.instants_ns if at_ns not in gone]
@@ -109,7 +109,7 @@ class StandstillPlaces:
         return self._decide() if self._places else {}
 
     def _place(self, place_mm: Place, joints: Mapping[str, float]) -> _Place:
-        """The nearest place that a fix may belong to, or a new one."""
+        """Return the nearest place that a fix may belong to, or a new place."""
         near = [place for place in self._places if self._is_near(place, place_mm, joints)]
         if near:
             return min(near, key=lambda place: math.dist(place_mm, place.latest_mm))
@@ -122,13 +122,13 @@ class StandstillPlaces:
         return made
 
     def _is_near(self, place: _Place, place_mm: Place, joints: Mapping[str, float]) -> bool:
-        """True if scatter, sway and what the joints have moved since explain the distance from a place's latest fix."""
+        """Return True if scatter, sway and the joints' motion explain the distance from a place's latest fix."""
         changes = {column: joints[column] - place.joints[column] for column in joints.keys() & place.joints.keys()}
         moved_mm = sum(_size(column, change) * self._travel_mm[column] for column, change in changes.items())
         return math.dist(place_mm, place.latest_mm) <= SAME_PLACE_MM + moved_mm
 
     def _decide(self) -> Exclusions:
-        """Exclude all but the place with the most fixes; the fixes for which that is news."""
+        """Exclude all places except the one with the most fixes, and return the exclusions that change."""
         self._decided_at = self._fixes
         most = max(place.count for place in self._places)
         first, *others = [place for place in self._places if place.count == most]
@@ -158,12 +158,12 @@ def _metres(place: _Place, other: _Place) -> str:
 
 
 def _size(column: str, change: float) -> float:
-    """Size of a joint's change; of an angle the short way round."""
+    """Return the size of a joint's change; for an angle, of the shorter way round."""
     return abs(math.remainder(change, 360.0) if column.endswith("_deg") else change)
 
 
 def travel_mm(rig: Rig) -> dict[str, float]:
-    """Return, for each joint's column, how far a change of 1 in it moves any prism at most, mm."""
+    """Return, for each joint's column, the largest motion in mm of any prism for a change of 1 in the column."""
     reach_mm = sum(abs(row.a_mm) + abs(row.d_mm) + abs(row.b_mm) for row in rig.rows)
     reach_mm += sum(math.hypot(b.x_mm, b.y_mm, b.z_mm) for row in rig.rows if (b := row.before) is not None)
     reach_mm += sum(max(map(abs, joint.limits)) for joint in rig.joints if joint.kind == "prismatic")

@@ -1,4 +1,4 @@
-"""The store in words: docs/reference/schema.md, and metadata for Datasette.
+"""Description of the store for people: docs/reference/schema.md, and metadata for Datasette.
 
-words  the meaning of every table, view and column;  description  a store's tables with them;  pages  the two documents
+table_words, view_words  the meaning of every table, view and column;  description  a store's tables with their meanings
 """

@@ -1,4 +1,4 @@
-"""A store's tables and views as they are, each column with its meaning and what it refers to."""
+"""Description of a store's actual tables and views: the meaning of each column and the table that it refers to."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ class ColumnDescription:
     """A column.
 
     Attributes:
-        name: of the column.
+        name: name of the column.
         type: INTEGER, REAL, TEXT or BLOB; "" in a view.
-        meaning: in words.
-        refers_to: the table whose row it names; None for no table.
+        meaning: meaning of its values.
+        refers_to: table whose rows it refers to; None if it refers to none.
     """
 
     name: str
@@ -40,9 +40,9 @@ class TableDescription:
     """A table or a view.
 
     Attributes:
-        name: of the table.
+        name: name of the table.
         words: title and description.
-        columns: in their order.
+        columns: its columns, in order.
         is_view: True for a view.
     """
 
@@ -54,10 +54,10 @@ class TableDescription:
 
 @dataclass(frozen=True)
 class StoreDescription:
-    """A store in words.
+    """Description of a store.
 
     Attributes:
-        tables: views first, then tables, both by name.
+        tables: views first, then tables, both sorted by name.
         queries: the canned queries.
     """
 
@@ -66,10 +66,11 @@ class StoreDescription:
 
 
 def describe_store(path: Path) -> StoreDescription:
-    """Describe a store, which the daemon may be writing to.
+    """Describe a store; the daemon may be writing to it.
 
     Raises:
-        StoreError: there is none, or it has a table or a column without words: a newer or an older program made it.
+        StoreError: there is no store, or it has a table or column without a description, because a newer or older
+            program made it.
     """
     if not path.is_file():
         raise StoreError(f"{path}: there is no store")

@@ -10,7 +10,7 @@ from daemon.store.describe.description import StoreDescription
 _YAML_WORDS = {"y", "n", "yes", "no", "on", "off", "true", "false", "null"}
 _TITLE = "rigcal: acquisition and calibration of a drilling boom"
 _ABOUT = (
-    "Readings, fixes, sessions, observations, jobs and models of a rig. Begin with the views (v_...) and the queries."
+    "Readings, fixes, sessions, observations, jobs and models of a rig. Start with the views (v_...) and the queries."
 )
 
 
@@ -18,8 +18,8 @@ def datasette_metadata(store: StoreDescription, database: str = "rigcal") -> str
     """Return the `metadata.yaml` of a store.
 
     Args:
-        store: in words.
-        database: name of the file without its ending.
+        store: description of the store.
+        database: name of the database file without its suffix.
     """
     tables = {
         table.name: {
@@ -48,7 +48,7 @@ def datasette_metadata(store: StoreDescription, database: str = "rigcal") -> str
 
 
 def _yaml(value: object, indent: str = "") -> Iterator[str]:
-    """Yield the lines of a mapping as YAML: quoted text as JSON has it, text of several lines as blocks."""
+    """Yield the lines of a mapping as YAML: text quoted as in JSON, text of several lines as blocks."""
     assert isinstance(value, dict)
     for name, item in value.items():
         key = json.dumps(name) if name.lower() in _YAML_WORDS else name

@@ -1,4 +1,4 @@
-"""Meanings of the store's views: a column that repeats a table's has the table's words, the others have their own."""
+"""Meanings of the store's views: a column taken from a table has the table's description, others have their own."""
 
 from __future__ import annotations
 
@@ -9,21 +9,21 @@ from daemon.store.describe.words import Words
 from daemon.store.views import iso, views
 
 _ORDER = {
-    "boot_id": "boot of the computer; together with `monotonic_ns` the order of time, and indexed",
+    "boot_id": "boot of the computer; with `monotonic_ns` it gives the order of time, and both are indexed",
     "monotonic_ns": "ns on the monotonic clock of that boot",
 }
-_DURATION = {"duration_s": "how long it took, s"}
+_DURATION = {"duration_s": "duration, s"}
 
 
 def _words(view: str, title: str, description: str, own: Mapping[str, str], *, has_channels: bool = False) -> Words:
-    """Return a view in words.
+    """Return the description of a view.
 
     Args:
-        view: its name.
-        title: as of `Words`.
-        description: as of `Words`.
-        own: meanings of the columns that are not a table's, or mean more in the view.
-        has_channels: as of `Words`.
+        view: name of the view.
+        title: as in `Words`.
+        description: as in `Words`.
+        own: meanings of columns that are not taken from a table, or that differ in the view.
+        has_channels: as in `Words`.
     """
     found = views(())[view]
     table = found.source.split()[0]
@@ -45,24 +45,24 @@ VIEWS: dict[str, Words] = {
     "v_fixes": _words(
         "v_fixes",
         "Fixes, angles in degrees",
-        "What the total stations sent, one row an answer, failed measurements too.",
+        "One row for each record of a total station, including failed measurements.",
         {"hz_angle_deg": "horizontal angle, degrees", "zenith_angle_deg": "zenith angle, degrees", **_ORDER},
     ),
     "v_joints": _words(
         "v_joints",
         "Joint readings, joints as columns",
         "One row for each reading: the column of its joint has the value, the others are empty. All readings within "
-        "sessions, elsewhere one a second.",
+        "sessions, one per second otherwise.",
         {"joint": "name of the joint", **_ORDER},
         has_channels=True,
     ),
     "v_sessions": _words(
         "v_sessions",
-        "Sessions with their numbers of observations",
+        "Sessions with the numbers of their observations",
         "One row for each calibration session.",
         {
-            "observations": "how many calibration may use",
-            "excluded_observations": "how many it must not use",
+            "observations": "number of observations that calibration may use",
+            "excluded_observations": "number of observations that it must not use",
             **_DURATION,
         },
     ),
@@ -72,7 +72,7 @@ VIEWS: dict[str, Words] = {
         "Models with their errors",
         "One row for each calibrated model.",
         {
-            "live_since": "ISO time, UTC: when it last went live, NULL where it never did",
+            "live_since": "ISO time, UTC: when it last went live, NULL if it never did",
             "training_rms_mm": "RMS error of its last stage on its own training rows, mm",
             "noise_mm": "scatter of a fix, mm",
         },
@@ -80,14 +80,21 @@ VIEWS: dict[str, Words] = {
     "v_alarms": _words(
         "v_alarms",
         "Alarms with their times",
-        "One row for each fault that was told.",
+        "One row for each alarm.",
         {"duration_s": "how long it lasted, s"},
     ),
 }
 
 
 def channel_meaning(column: str, name: str, unit: str, *, is_joint: bool) -> str:
-    """Return the meaning of a view's column that is of a joint or a signal."""
+    """Return the meaning of a view's column of a joint or a signal.
+
+    Args:
+        column: name of the column.
+        name: name of the channel.
+        unit: unit of the channel.
+        is_joint: whether the channel is a joint.
+    """
     if column == f"{name}_dir":
         return f"last direction of motion of joint {name}: -1, 0 or 1"
     if column == f"{name}_rate":

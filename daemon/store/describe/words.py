@@ -1,4 +1,4 @@
-"""A table or a view in words. An instant is three columns, with a prefix where a row has several of them."""
+"""Description of a table or a view. An instant has three columns, with a prefix where a row has several instants."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 INSTANT = {
-    "utc_ns": "{}: ns since 1970 on the computer's clock, UTC, which may have been set wrongly",
+    "utc_ns": "{}: ns since 1970 on the computer's clock, UTC, which may have been wrong",
     "monotonic_ns": "{}: ns on the monotonic clock of its boot",
     "boot_id": "{}: the boot of that clock",
 }
@@ -14,15 +14,15 @@ INSTANT = {
 
 @dataclass(frozen=True)
 class Words:
-    """A table or a view in words.
+    """Description of a table or a view.
 
     Attributes:
-        title: its name for people.
-        description: what a row is.
-        columns: name -> meaning, but those of instants and the joints and signals of a view.
-        instants: prefix of an instant's three columns -> what happened then; "" where they have no prefix.
-        label: the column by which a row is named where other tables refer to it.
-        has_channels: a view with columns of joints, and of signals where it is of observations.
+        title: its title.
+        description: what a row represents.
+        columns: name -> meaning, without the columns of instants, and without a view's joints and signals.
+        instants: prefix of an instant's three columns -> what happened at that instant; "" for no prefix.
+        label: column that names a row where other tables refer to it.
+        has_channels: a view with columns of joints; a view of observations also has columns of signals.
     """
 
     title: str
@@ -33,7 +33,7 @@ class Words:
     has_channels: bool = False
 
     def meanings(self) -> dict[str, str]:
-        """Every column that is described -> its meaning."""
+        """Return every described column -> its meaning."""
         of_instants = {
             f"{prefix}{name}": meaning.format(event)
             for prefix, event in self.instants.items()

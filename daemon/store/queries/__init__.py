@@ -1,1 +1,1 @@
-"""Statements of each subject: one module for alarms, guides, jobs, models, sessions and so on."""
+"""SQL statements by subject: one module each for alarms, guides, jobs, models, sessions and so on."""

@@ -1,4 +1,4 @@
-"""The table of alarms: those that are active and those that were."""
+"""The table of alarms, active and cleared."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ class AlarmTable:
         self._store = store
 
     def active(self) -> list[dict[str, Any]]:
-        """The alarms that are not cleared, oldest first, with the instant `raised`; none where the table is damaged."""
+        """Return the active alarms, oldest first, with the instant `raised`; none if the table is damaged."""
         rows: list[dict[str, Any]] = self._store.unless_damaged(lambda: self._store.rows(_ACTIVE), [])
         return [row | {"raised": self._store.stamp(row, "raised_")} for row in rows]
 
     def add(self, raised: Stamp, kind: str, subject: str, **about: str) -> int:
-        """Add an alarm, in the place of one of that kind and subject that is still active; its number."""
+        """Add an alarm, clear any active alarm of the same kind and subject, and return the new alarm's number."""
         key: dict[str, object] = {"kind": kind, "subject": subject}
         with self._store.transaction():
             self._store.update("alarms", {**key, "cleared_utc_ns": None}, self._store.instant(raised, "cleared_"))
@@ -38,11 +38,11 @@ class AlarmTable:
         self._store.update("alarms", {"id": alarm_id}, about)
 
     def clear(self, alarm_id: int, cleared: Stamp) -> None:
-        """Note the end of an alarm."""
+        """Mark an alarm as cleared."""
         self._store.update("alarms", {"id": alarm_id}, self._store.instant(cleared, "cleared_"))
 
     def cleared(self, most: int) -> list[dict[str, Any]]:
-        """The alarms that were cleared, newest first."""
+        """Return the cleared alarms, newest first, at most `most`."""
         return self._store.rows(
             "SELECT kind, subject, severity, text, remedy, raised_utc_ns AS since_utc_ns, cleared_utc_ns FROM alarms "
             "WHERE cleared_utc_ns IS NOT NULL ORDER BY id DESC LIMIT ?",

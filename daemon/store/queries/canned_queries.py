@@ -1,7 +1,7 @@
-"""Queries that people ask of a store again and again; each finds its rows by an index, however large the store is.
+"""Ready-made queries for people; each finds its rows by an index, however large the store is.
 
 Parameters are written `:name`. A session's readings are found by its first and last instant on the monotonic clock,
-which the indexes of the large tables have; the wall clock may have been set in between.
+which is in the indexes of the large tables; the wall clock may have been set in between.
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ from daemon.store.views import Channel, in_session, iso
 
 @dataclass(frozen=True)
 class Query:
-    """A query with its name for people.
+    """A query with its description.
 
     Attributes:
-        name: in addresses.
-        title: what it shows.
-        description: what its rows and columns are.
+        name: name in addresses.
+        title: what the query shows.
+        description: meaning of its rows and columns.
         sql: the query.
-        parameters: name -> a value that a form shows first.
+        parameters: names of its parameters.
     """
 
     name: str
@@ -35,7 +35,7 @@ def canned_queries(channels: Iterable[Channel]) -> tuple[Query, ...]:
     """Return the queries for a store.
 
     Args:
-        channels: those of the store; joints get columns.
+        channels: channels of the store; there is a column for each joint.
     """
     joints = [channel for channel in channels if channel.is_joint]
     return (
@@ -48,7 +48,8 @@ def canned_queries(channels: Iterable[Channel]) -> tuple[Query, ...]:
         Query(
             "observations_of_session",
             "Observations of a session",
-            "The rows that calibration sees, with their joints, and those that it does not, with the reason.",
+            "The observations with their joints: those that calibration uses, and those that it does not use, with the "
+            "reason.",
             "SELECT * FROM v_observations WHERE session = :session ORDER BY time",
             ("session",),
         ),
@@ -87,7 +88,7 @@ FROM means JOIN channels ON channels.id = channel_id GROUP BY boot_id, second OR
         Query(
             "fixes_of_session",
             "Fixes in a session",
-            "Everything that the stations sent from the start of a session to its end, failed measurements too.",
+            "All records of the stations from the start of a session to its end, including failed measurements.",
             f"""SELECT row.id AS fix, station, {iso("row.utc_ns")} AS time, row.status, lock,
     hz_angle_rad * 57.29577951308232 AS hz_angle_deg, zenith_angle_rad * 57.29577951308232 AS zenith_angle_deg,
     slope_distance_m, reason
@@ -105,7 +106,7 @@ ORDER BY row.id""",
         Query(
             "newest_joints",
             "Newest reading of each joint",
-            "The joints as they were last read, within ten seconds before the newest reading of any.",
+            "The last reading of each joint, within ten seconds before the newest reading of any joint.",
             f"""WITH newest AS
     (SELECT boot_id, monotonic_ns FROM joint_samples ORDER BY boot_id DESC, monotonic_ns DESC LIMIT 1)
 SELECT channels.name AS joint, channels.unit, {iso("max(row.utc_ns)")} AS time, row.value, row.status
@@ -116,14 +117,15 @@ GROUP BY row.channel_id ORDER BY row.channel_id""",
         Query(
             "gaps_by_channel",
             "Gaps by channel and reason",
-            "How often and how long each channel gave nothing, and why; an open gap counts as one without an end.",
+            "How often and for how long each channel gave no usable data, and why; an open gap is counted without its "
+            "duration.",
             f"""SELECT channel, reason, count(*) AS gaps, sum(end_utc_ns - start_utc_ns) / 1e9 AS total_s,
     count(*) FILTER (WHERE end_utc_ns IS NULL) AS still_open, {iso("max(start_utc_ns)")} AS newest
 FROM gaps GROUP BY channel, reason ORDER BY total_s DESC""",
         ),
         Query(
             "model_history",
-            "Which model was live, since when, and who said so",
+            "Which model was live, since when, and who decided it",
             "Every change of a model's state.",
             f"""SELECT {iso("change.utc_ns")} AS time, change.model_id AS model, model.rig, model.stage, change.state,
     change.operator, change.caller_user AS user, change.reason, change.replaced_id AS replaced

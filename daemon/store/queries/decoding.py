@@ -1,4 +1,4 @@
-"""Captures that wait to be decoded, and what may still come of them."""
+"""Captures that wait to be decoded, and whether they may still give observations."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ OLDEST_WAITING = """SELECT first_boot_id, first_monotonic_ns FROM undecoded_chun
     CROSS JOIN raw_chunks ON raw_chunks.id = chunk_id ORDER BY first_boot_id, first_monotonic_ns LIMIT 1"""
 _IS_UNDECODED = f"""SELECT 1 FROM calibration_sessions
     WHERE id = ?1 AND (ended_boot_id, ended_monotonic_ns + ?2) >= ({OLDEST_WAITING})"""
-# The last run has not ended, and has stored nothing that is so much younger.
+# The last run has not ended, and has stored no captures from that long after the session's end.
 _IS_STILL_READ = """SELECT 1 FROM calibration_sessions
     WHERE id = ?1 AND EXISTS (SELECT 1 FROM daemon_runs
             WHERE id = (SELECT max(id) FROM daemon_runs) AND ended_utc_ns IS NULL)
@@ -21,19 +21,19 @@ _IS_STILL_READ = """SELECT 1 FROM calibration_sessions
 
 
 def is_undecoded(source: RowSource, session_id: str, after_ns: int) -> bool:
-    """Return True if captures of a session that has ended, or of so long after its end, wait to be decoded."""
+    """Return True if captures of an ended session, or from up to `after_ns` after its end, wait to be decoded."""
     return any(True for _ in source.rows(_IS_UNDECODED, (session_id, after_ns)))
 
 
 def is_being_joined(source: RowSource, session_id: str, after_ns: int) -> bool:
     """Return True if a daemon may still make observations of a session that has ended.
 
-    A fix waits for joints that are read after it.
+    A fix waits for joint readings that are taken after it.
 
     Args:
         source: the store.
         session_id: the session.
-        after_ns: how long after its end captures may belong to it.
+        after_ns: how long after the session's end captures may belong to it.
     """
     is_read = any(True for _ in source.rows(_IS_STILL_READ, (session_id, after_ns)))
     return is_read or is_undecoded(source, session_id, after_ns)
@@ -42,9 +42,14 @@ def is_being_joined(source: RowSource, session_id: str, after_ns: int) -> bool:
 def decoded_before(
     reader: Reader, stretches: Sequence[tuple[Stamp, Stamp]], margin_ns: int
 ) -> list[tuple[Stamp, Stamp]]:
-    """Cut stretches so long before the oldest capture that waits to be decoded; those that lie behind it are left out.
+    """Cut stretches at a margin before the oldest capture that waits to be decoded, and drop those after it.
 
-    Acquisition stores the records of what waits, and does not look whether they are there already.
+    Acquisition stores the records of waiting captures without checking whether they are stored already.
+
+    Args:
+        reader: the store.
+        stretches: stretches of time, each within one boot.
+        margin_ns: the margin.
     """
     oldest = next(reader.rows(OLDEST_WAITING), None)
     if oldest is None:

@@ -1,4 +1,4 @@
-"""The last words of CANopen devices on their own state: emergencies, alarms, boot-ups, heartbeats."""
+"""The last reports of CANopen devices on their own state: emergencies, alarms, boot-ups, heartbeats."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ STATES = (
     EventKind.HEARTBEAT_RESTORED,
     EventKind.WARNING,
 )
-# Steps from one device to the next by the index, however many events each has.
+# Goes from one device to the next by the index, however many events each device has.
 _DEVICES = """WITH RECURSIVE named(device) AS (
         SELECT min(device) FROM device_events
         UNION ALL SELECT (SELECT min(device) FROM device_events WHERE device > named.device)
@@ -31,10 +31,10 @@ _LAST = """SELECT id, utc_ns, monotonic_ns, boot_id, device, kind, text, code FR
 
 
 def device_states(source: Connection | Reader, before: Stamp) -> list[DeviceEvent]:
-    """Return the last event of each device and kind in the boot of an instant and before it, oldest first.
+    """Return the last event of each device and kind before an instant, in its boot, oldest first.
 
-    Of emergencies it is the last one, and the last one that voids values beside it. Events that devices did not send
-    themselves, as of a set-up that failed, have no code and are left out.
+    For emergencies both the last one and the last one that voids values are returned. Events that were not sent by the
+    devices themselves, such as that of a failed set-up, have no code and are left out.
 
     Args:
         source: the store.
@@ -54,6 +54,6 @@ def device_states(source: Connection | Reader, before: Stamp) -> list[DeviceEven
             found |= {row["id"]: row for row in rows}
     return [
         DeviceEvent(row["device"], source.stamp(row), EventKind(row["kind"]), row["text"], row["code"])
-        # Frames that were read at once share a stamp.
+        # Frames that were read together share a stamp.
         for row in sorted(found.values(), key=lambda row: (row["monotonic_ns"], row["id"]))
     ]

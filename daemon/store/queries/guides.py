@@ -1,4 +1,4 @@
-"""The tables of guided sessions: guides, and what has happened in them."""
+"""The tables of guided sessions: guides and their events."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 from daemon.store.connection import Connection
 from drivers.clock import Stamp
 
-# The newest standstill whose observations count. Asked ten times a second: by number, not by all rows of the session.
+# The newest standstill with used observations. Runs ten times a second, so it searches by number, not all rows.
 _STANDSTILL = """SELECT pose, count(*) AS fixes, max(id) AS last FROM observations NOT INDEXED
     WHERE session_id = ? AND id > ? AND excluded IS NULL AND pose IS NOT NULL
     GROUP BY pose ORDER BY last DESC LIMIT 1"""
@@ -21,13 +21,13 @@ class GuideRow:
     """A guide.
 
     Attributes:
-        id: its number.
+        id: number of the guide.
         state: open, finished or abandoned.
         setup_id: set-up of its station.
-        operator: who is responsible.
-        request: what it was asked for.
-        taps: number of commands that were given to it.
-        started: when.
+        operator: operator who is responsible.
+        request: its request.
+        taps: number of commands given to it.
+        started: when it was started.
     """
 
     id: int
@@ -41,11 +41,11 @@ class GuideRow:
 
 @dataclass(frozen=True)
 class EventRow:
-    """Something that has happened in a guide.
+    """An event of a guide.
 
     Attributes:
         kind, details: see `daemon.guide.job`.
-        at: when.
+        at: instant of the event.
     """
 
     kind: str
@@ -55,13 +55,13 @@ class EventRow:
 
 @dataclass(frozen=True)
 class Standstill:
-    """A standstill of the open session whose observations count.
+    """A standstill of the open session with used observations.
 
     Attributes:
-        pose: its label.
-        fixes: how many count.
+        pose: label of the standstill.
+        fixes: number of used fixes.
         last: number of the newest observation.
-        values: observations column -> number, of that one.
+        values: observations column -> number, of the newest observation.
     """
 
     pose: str
@@ -75,14 +75,14 @@ class GuideTable:
 
     Args:
         store: the database.
-        rig_name: whose guides they are.
+        rig_name: name of the rig.
     """
 
     def __init__(self, store: Connection, rig_name: str) -> None:
         self._store, self._rig = store, rig_name
 
     def newest(self) -> GuideRow | None:
-        """The newest guide; None before the first."""
+        """Return the newest guide; None before the first."""
         rows = self._store.rows("SELECT * FROM guides WHERE rig = ? ORDER BY id DESC LIMIT 1", (self._rig,))
         if not rows:
             return None
@@ -95,7 +95,7 @@ class GuideTable:
         return bool(self._store.rows("SELECT 1 FROM guides WHERE rig = ? AND state = 'open'", (self._rig,)))
 
     def open(self, started: Stamp, setup_id: str, operator: str, request: Mapping[str, Any], **caller: object) -> int:
-        """Add an open guide; its number."""
+        """Add an open guide, and return its number."""
         row = {
             "rig": self._rig,
             "state": "open",
@@ -107,29 +107,29 @@ class GuideTable:
         return self._store.insert("guides", {**row, **caller, **self._store.instant(started, "started_")})
 
     def count_taps(self, guide_id: int, taps: int) -> None:
-        """Note how many commands were given to a guide."""
+        """Set the number of commands given to a guide."""
         self._store.update("guides", {"id": guide_id}, {"taps": taps})
 
     def end(self, guide_id: int, state: str, ended: Stamp) -> None:
-        """Note that a guide is finished or abandoned."""
+        """Mark a guide as finished or abandoned."""
         self._store.update("guides", {"id": guide_id}, {"state": state, **self._store.instant(ended, "ended_")})
 
     def add(self, guide_id: int, kind: str, details: Mapping[str, Any], at: Stamp, **caller: object) -> None:
-        """Add something that has happened."""
+        """Add an event."""
         row = {"guide_id": guide_id, "kind": kind, "details_json": details, **caller}
         self._store.insert("guide_events", {**row, **self._store.instant(at)})
 
     def events(self, guide_id: int) -> list[EventRow]:
-        """All that has happened in a guide, oldest first."""
+        """Return all events of a guide, oldest first."""
         rows = self._store.rows("SELECT * FROM guide_events WHERE guide_id = ? ORDER BY id", (guide_id,))
         return [EventRow(row["kind"], json.loads(row["details_json"]), self._store.stamp(row)) for row in rows]
 
     def newest_observation(self) -> int:
-        """Number of the newest observation of all; 0 before the first."""
+        """Return the number of the store's newest observation; 0 before the first."""
         return self._store.number("SELECT coalesce(max(id), 0) FROM observations", ()) or 0
 
     def standstill(self, session_id: str, after: int) -> Standstill | None:
-        """The newest standstill of a session with observations that count and are newer than number `after`."""
+        """Return a session's newest standstill with used observations newer than number `after`, or None."""
         rows = self._store.rows(_STANDSTILL, (session_id, after))
         if not rows:
             return None

@@ -1,4 +1,4 @@
-"""Histories that the page draws: a session's fixes, drift of the live models, control points, changes of models."""
+"""Histories shown on the page: a session's fixes, drift of the live models, control points, changes of models."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import Any
 
 from daemon.store.rows import RowSource
 
-_MOST = 2000  # rows of a list; the newest
+_MOST = 2000  # newest rows in a list
 
 _FIXES = """SELECT id, pose, utc_ns, x_mm, y_mm, z_mm, dwell_s, excluded FROM observations
     WHERE session_id = ? ORDER BY id DESC LIMIT ?"""
@@ -23,14 +23,14 @@ _CHANGES = """SELECT state.model_id AS model, state.state, state.utc_ns, state.o
 
 
 def session_fixes(source: RowSource, session_id: str) -> list[dict[str, Any]] | None:
-    """Return a session's newest fixes with why any is excluded, oldest first; None of a session that there is not."""
+    """Return a session's newest fixes with the reasons of exclusions, oldest first; None for an unknown session."""
     if not list(source.rows("SELECT 1 FROM calibration_sessions WHERE id = ?", (session_id,))):
         return None
     return list(source.rows(_FIXES, (session_id, _MOST)))[::-1]
 
 
 def drift_history(source: RowSource, rig_name: str) -> list[dict[str, Any]]:
-    """Return every check session that was held against the model that was live then, oldest first."""
+    """Return all comparisons of check sessions with the model that was live at the time, oldest first."""
     return list(source.rows(_DRIFT, (rig_name, _MOST)))[::-1]
 
 

@@ -1,4 +1,4 @@
-"""The table of jobs: what scheduling, running and showing them asks of it."""
+"""The table of jobs: queries for scheduling, running and showing them."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from daemon.store.queries.models import ModelRow
 from daemon.store.rows import marks
 from drivers.clock import NS_PER_S, Clock, Stamp
 
-# Scheduling runs twice a second beside acquisition, for months: CROSS JOIN and NOT INDEXED keep SQLite's planner from
-# starting with all of a rig's sessions.
-# The newest session of each kind and state that calibration may use; the index holds all that it asks for.
+# Scheduling runs twice a second in parallel with acquisition, for months. CROSS JOIN and NOT INDEXED keep SQLite's
+# planner from starting with all of a rig's sessions.
+# The newest session of each kind and state that calibration may use; the index contains all columns of the query.
 _SESSIONS = """SELECT id, rowid AS number, kind, state, ended_utc_ns, ended_monotonic_ns, ended_boot_id
     FROM calibration_sessions WHERE rowid IN
         (SELECT max(rowid) FROM calibration_sessions
@@ -29,8 +29,8 @@ _PENDING = """SELECT job.id, job.kind, job.session_id, job.state, job.attempts,
     FROM jobs AS job CROSS JOIN calibration_sessions AS session ON session.id = job.session_id
         LEFT JOIN jobs AS before ON before.id = job.depends_on
     WHERE job.state IN ('queued', 'running', 'interrupted') AND session.rig = ? ORDER BY job.id"""
-# Walks back from the newest session to one that a job of this kind was queued through, or that no longer matters. A job
-# that was queued before an operator accepted a session does not work on that one, and covers nothing any more.
+# Goes back from the newest session to one through which a job of this kind was queued, or that no longer matters. A job
+# that was queued before an operator accepted a session does not work on that session, and no longer covers anything.
 _COVERED = f"""SELECT session.rowid AS number FROM calibration_sessions AS session NOT INDEXED
     WHERE session.rig = ?1 AND session.rowid > ?2
         AND EXISTS (SELECT 1 FROM jobs WHERE jobs.through_session_id = session.id AND jobs.kind = ?3 AND jobs.id >
@@ -51,7 +51,7 @@ _FAILED = """SELECT max(job.id) AS id, job.kind, job.error FROM jobs AS job
     WHERE job.state = 'failed' AND session.rig = ? GROUP BY job.kind ORDER BY job.id"""
 _DONE_LATER = """SELECT 1 FROM jobs AS job CROSS JOIN calibration_sessions AS session ON session.id = job.session_id
     WHERE job.state = 'done' AND job.id > ? AND job.kind = ? AND session.rig = ? LIMIT 1"""
-# The first job that works on a session, one of some kinds: it was queued after the session ended, or was accepted.
+# The first job of some kinds that works on a session: it was queued after the session ended or was accepted.
 _FIRST_ON = """SELECT job.id, job.session_id FROM jobs AS job
     JOIN calibration_sessions AS through ON through.id = job.through_session_id
     JOIN calibration_sessions AS session ON session.id = ?1
@@ -64,7 +64,7 @@ _SHOWN = """id, kind, session_id, state, progress, message, attempts, error,
 
 
 class JobKind(StrEnum):
-    """Kind of a job: the work that it does."""
+    """Kind of a job."""
 
     GAP = "gap"
     RESIDUAL = "residual"
@@ -75,14 +75,14 @@ class JobKind(StrEnum):
 
 @dataclass(frozen=True)
 class SessionFacts:
-    """A calibration session, as far as scheduling needs it.
+    """The facts of a calibration session that scheduling needs.
 
     Attributes:
-        id: of the session.
-        number: grows from one session to the next. One is open at a time, so they end in the order they start.
+        id: id of the session.
+        number: increases from one session to the next. One is open at a time, so they end in the order of their start.
         kind: single_joint, multi_joint, static_poses or check.
         state: open, closed or aborted.
-        ended: when it was closed, None while open.
+        ended: when it was closed; None while open.
     """
 
     id: str
@@ -94,17 +94,17 @@ class SessionFacts:
 
 @dataclass(frozen=True)
 class JobFacts:
-    """A job that has not ended for good, as far as scheduling needs it.
+    """The facts of an unfinished job that scheduling needs.
 
     Attributes:
-        id: of the job.
+        id: number of the job.
         kind: see JobKind.
         session_id: the session that triggered it.
         state: queued, running or interrupted.
-        attempts: how often it was started.
+        attempts: number of attempts.
         is_ready: whether the job that it depends on, if any, is done.
-        ended: when it was interrupted last.
-        interruptions: how often something interrupted it that was no attempt: the computer's own end, a full disk.
+        ended: when it was last interrupted.
+        interruptions: number of interruptions that do not count as attempts: a shutdown of the computer, a full disk.
     """
 
     id: int
@@ -119,10 +119,10 @@ class JobFacts:
 
 @dataclass(frozen=True)
 class FailedJob:
-    """The newest failed job of its kind, with no later one done.
+    """The newest failed job of its kind, if no later job of the kind is done.
 
     Attributes:
-        id, kind: of the job.
+        id, kind: number and kind of the job.
         error: why it failed.
     """
 
@@ -136,7 +136,7 @@ class JobTable:
 
     Args:
         store: the database.
-        rig_name: whose sessions are worked on.
+        rig_name: name of the rig.
     """
 
     def __init__(self, store: Connection, rig_name: str) -> None:
@@ -145,7 +145,7 @@ class JobTable:
     # ---- for scheduling ----------------------------------------------------------------------------------------------
 
     def newest_sessions(self) -> list[SessionFacts]:
-        """The newest session of each kind and state that calibration may use, in the order they were started."""
+        """Return the newest session of each kind and state that calibration may use, in order of their start."""
         rows = self._store.rows(_SESSIONS, (self._rig,))
         return [
             SessionFacts(row["id"], row["number"], row["kind"], row["state"], self._store.stamp_or_none(row, "ended_"))
@@ -153,7 +153,7 @@ class JobTable:
         ]
 
     def pending(self) -> list[JobFacts]:
-        """Jobs that have not ended for good, in the order they were created."""
+        """Return the unfinished jobs, in order of creation."""
         return [
             JobFacts(
                 row["id"],
@@ -169,23 +169,23 @@ class JobTable:
         ]
 
     def covered(self, kind: JobKind, after_session: int) -> int | None:
-        """Number of the newest session that the newest job of a kind works on; None where there is none.
+        """Return the number of the newest session that a job of a kind works on; None if there is none.
 
         Args:
-            kind: of the job.
-            after_session: sessions up to this number do not matter.
+            kind: kind of the job.
+            after_session: sessions up to this number are ignored.
         """
         return self._store.number(_COVERED, (self._rig, after_session, kind.value, kind is not JobKind.GAP))
 
     def is_comparison_queued(self, model_id: int, live_since: int) -> bool:
-        """True if a model was ever to be compared with the one that went live by that change."""
+        """Return True if a comparison of a model with the one that went live by change `live_since` was ever queued."""
         sql = "SELECT 1 FROM jobs WHERE kind = 'comparison' AND model_id = ? AND live_since = ? LIMIT 1"
         return bool(self._store.rows(sql, (model_id, live_since)))
 
     def comparison_of(self, model: ModelRow) -> int | None:
-        """Return the job that is yet to compare a model on held-out sessions; None without one.
+        """Return the unfinished job that compares a model on held-out sessions; None if there is none.
 
-        One that names no model compares that of the job before it, or else the newest one.
+        A comparison that names no model compares the model of the job on which it depends, or else the newest model.
         """
         sql = """SELECT job.id FROM jobs AS job LEFT JOIN jobs AS made ON made.id = job.depends_on
             WHERE job.kind = 'comparison' AND job.state IN ('queued', 'running', 'interrupted') AND coalesce(
@@ -195,9 +195,9 @@ class JobTable:
         return int(found[0]["id"]) if found else None
 
     def comparison_after(self, model: ModelRow) -> tuple[int, int] | None:
-        """Return the job that is yet to compare the model of a later stage, and the job that makes that; or None.
+        """Return the unfinished job that compares the model of a later stage, and the job that makes it; or None.
 
-        The model of a later stage is made from this one and of the same sessions.
+        The model of the later stage is made from this model and from the same sessions.
         """
         sql = """SELECT job.id, job.depends_on FROM jobs AS job JOIN jobs AS later ON later.id = job.depends_on
             JOIN jobs AS made ON made.id = later.depends_on
@@ -210,10 +210,10 @@ class JobTable:
     # ---- one job -----------------------------------------------------------------------------------------------------
 
     def get(self, job_id: object) -> dict[str, Any]:
-        """A job's row.
+        """Return a job's row.
 
         Raises:
-            NotInStoreError: there is none of that number.
+            NotInStoreError: there is no job of that number.
         """
         found = type(job_id) is int and self._store.rows("SELECT * FROM jobs WHERE id = ?", (job_id,))
         if not found:
@@ -221,71 +221,71 @@ class JobTable:
         return found[0]
 
     def result(self, job_id: int) -> dict[str, Any]:
-        """Result of a job; empty before it has one."""
+        """Return the result of a job; empty before it has one."""
         return _result(self.get(job_id))
 
     def newest(self, kind: JobKind, state: str) -> dict[str, Any] | None:
-        """The newest job of a kind in a state, with its `result`; None where there is none."""
+        """Return the newest job of a kind in a state, with its `result`; None if there is none."""
         found = self._store.rows(_NEWEST, (kind, state, self._rig))
         return found[0] | {"result": _result(found[0])} if found else None
 
     def latencies(self) -> dict[str, dict[str, Any]]:
-        """Session -> latency of its fixes against the joints, of the newest report; empty before one."""
+        """Return session -> latency of its fixes relative to the joints, from the newest report; empty without one."""
         report = self.newest(JobKind.REPORT, "done")
         return {} if report is None else dict(report["result"].get("latency", {}))
 
     def has_done(self, kind: JobKind) -> bool:
-        """True if a job of a kind was ever done."""
+        """Return True if a job of a kind was ever done."""
         return bool(self._store.rows(_NEWEST, (kind, "done", self._rig)))
 
     def sessions_of(self, job_id: int, through_session_id: str) -> list[dict[str, Any]]:
-        """Number, id and kind of the sessions that a job works on, settled when it was queued; oldest first."""
+        """Return number, id and kind of the sessions that a job works on, fixed when it was queued; oldest first."""
         return self._store.rows(_WORKED_ON, (self._rig, job_id, through_session_id))
 
     def chain(self, job_id: int) -> list[dict[str, Any]]:
-        """Id and state of a job and, in order, of all that wait for it."""
+        """Return id and state of a job and of all jobs that wait for it, in order."""
         return self._store.rows(_CHAIN, (job_id,))
 
     # ---- lists -------------------------------------------------------------------------------------------------------
 
     def all(self, clock: Clock) -> list[dict[str, Any]]:
-        """All jobs with their results, newest last, and how long each took or runs already, in real time.
+        """Return all jobs with their results, newest last, and their durations so far, in real time.
 
-        Read beside the writing connection, which must not wait.
+        Uses a separate connection, so that the writing connection does not wait.
         """
         with self._store.reader() as reader:
             rows = reader.rows(f"SELECT {_SHOWN}, result_json FROM jobs ORDER BY id")
             return [_shown(row, clock) for row in rows]
 
     def unfinished(self) -> list[dict[str, Any]]:
-        """Jobs that run, wait, or will be offered again, without results, newest last."""
+        """Return the jobs that are running, waiting or interrupted, without results, newest last."""
         sql = f"SELECT {_SHOWN} FROM jobs WHERE state IN ('queued', 'running', 'interrupted') ORDER BY id"
         return self._store.rows(sql)
 
     def counts(self) -> list[dict[str, Any]]:
-        """Kind, state and `count` of all jobs."""
+        """Return the `count` of jobs by kind and state."""
         return self._store.rows("SELECT kind, state, count(*) AS count FROM jobs GROUP BY kind, state")
 
     def running(self) -> list[dict[str, Any]]:
-        """Id and host_boot of the jobs that are marked as running."""
+        """Return id and host_boot of the jobs that are marked as running."""
         return self._store.rows("SELECT id, host_boot FROM jobs WHERE state = 'running'")
 
     def of_session(self, session_id: str, clock: Clock) -> list[dict[str, Any]]:
-        """The jobs that a session has triggered, as `all` has them."""
+        """Return the jobs triggered by a session, in the form of `all`."""
         sql = f"SELECT {_SHOWN}, result_json FROM jobs WHERE session_id = ? ORDER BY id"
         return [_shown(row, clock) for row in self._store.rows(sql, (session_id,))]
 
     def has_of_session(self, session_id: str) -> bool:
-        """True if a session has triggered a job."""
+        """Return True if a session has triggered a job."""
         return bool(self._store.rows("SELECT 1 FROM jobs WHERE session_id = ? LIMIT 1", (session_id,)))
 
     def first_on(self, session_id: str, *kinds: JobKind) -> dict[str, Any] | None:
-        """Id and session_id of the first job of some kinds that works on a session; None where there is none."""
+        """Return id and session_id of the first job of some kinds that works on a session; None if there is none."""
         sql = _FIRST_ON.format(kinds=marks(kinds))
         return next(iter(self._store.rows(sql, (session_id, *kinds))), None)
 
     def failed(self) -> list[FailedJob]:
-        """The newest failed job of each kind, where no later one of the kind is done."""
+        """Return the newest failed job of each kind, unless a later job of the kind is done."""
         return [
             FailedJob(row["id"], row["kind"], row["error"] or "")
             for row in self._store.rows(_FAILED, (self._rig,))
@@ -293,13 +293,13 @@ class JobTable:
         ]
 
     def newest_id(self) -> int:
-        """Number of the newest job of any rig; 0 before the first."""
+        """Return the number of the newest job of any rig; 0 before the first."""
         return self._store.number("SELECT coalesce(max(id), 0) FROM jobs", ()) or 0
 
     # ---- changes -----------------------------------------------------------------------------------------------------
 
     def add(self, created: Stamp, **columns: object) -> int:
-        """Add a queued job; its number."""
+        """Add a queued job, and return its number."""
         return self._store.insert("jobs", {**columns, "state": "queued", **self._store.instant(created, "created_")})
 
     def change(self, job_id: int, **columns: object) -> None:
@@ -307,7 +307,7 @@ class JobTable:
         self._store.update("jobs", {"id": job_id}, columns)
 
     def offer_again(self, job_id: int) -> bool:
-        """Queue an interrupted job again; False if it is interrupted no more."""
+        """Queue an interrupted job again; return False if it is no longer interrupted."""
         return bool(self._store.update("jobs", {"id": job_id, "state": "interrupted"}, {"state": "queued"}))
 
 

@@ -1,8 +1,8 @@
-"""The tables of models: every model and its state, every change of it, and how live models did on check sessions.
+"""The tables of models: every model and its state, all changes of states, and results of live models on check sessions.
 
-A model is made as a candidate, goes live when an operator accepts it, and is retired when another takes its place; it
-can be put back. One is live per rig. Each change leaves a row in `model_states`; no row of these tables is ever
-deleted, and neither are the models' directories.
+A model is created as a candidate, goes live when an operator accepts it, and is retired when another model replaces it;
+it can be made live again. Each rig has one live model. Each change adds a row to `model_states`. No row of these tables
+is ever deleted, and neither are the models' directories.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from drivers.clock import Clock
 _MODELS = """SELECT model.id, model.rig, model.path, model.manifest_sha256, model.stage, model.state,
         model.metrics_json, model.created_utc_ns, job.result_json
     FROM models AS model LEFT JOIN jobs AS job ON job.id = model.job_id"""
-# This runs twice a second for months: each step finds its rows by an index.
+# This runs twice a second for months, so each step finds its rows by an index.
 _LIVE_RUN = """SELECT state.id AS since, model.id AS model_id, coalesce(state.after_session, 0) AS after_session
     FROM models AS model CROSS JOIN model_states AS state ON state.model_id = model.id
     WHERE model.rig = ? AND model.state = 'live' AND state.state = 'live' AND state.zeros_checked_through IS NULL
@@ -41,17 +41,17 @@ class ModelRow:
     """A model of the store.
 
     Attributes:
-        id: its number.
-        rig: name of the machine it is of.
+        id: number of the model.
+        rig: name of its machine.
         state: candidate, live or retired.
         stage: geometric, effects or hybrid.
         path: its directory.
-        manifest_sha256: of its manifest when it was written.
-        sessions: those that it was trained on.
-        created_utc_ns: when it was made.
-        metrics: errors on its training rows (`training`, `noise_mm`), its named `effects`, and `comparison`, where
-            there was one: its figures on held-out sessions beside those of the model `live` then, as
-            `evaluation.promotion` has them.
+        manifest_sha256: SHA-256 of its manifest when it was written.
+        sessions: sessions on which it was trained.
+        created_utc_ns: when it was created.
+        metrics: errors on its training rows (`training`, `noise_mm`), its named `effects`, and, if it was compared,
+            `comparison`: its figures on held-out sessions and those of the model that was `live` at that time, as in
+            `evaluation.promotion`.
     """
 
     id: int
@@ -71,18 +71,18 @@ class ModelRow:
         return found if isinstance(found, dict) else None
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the row as a JSON object, as the control socket gives it."""
+        """Return the row as a JSON object for the control socket."""
         return asdict(self) | {"path": str(self.path), "sessions": list(self.sessions)}
 
 
 @dataclass(frozen=True)
 class LiveRun:
-    """The time from a model's going live until another does.
+    """The period during which a model is live.
 
     Attributes:
-        since: number of the change by which it went live.
-        model_id: which model.
-        after_session: number of the rig's newest session then.
+        since: number of the change by which the model went live.
+        model_id: number of the model.
+        after_session: number of the rig's newest session at that time.
     """
 
     since: int
@@ -95,8 +95,8 @@ class ModelTable:
 
     Args:
         store: the database.
-        rig_name: whose models go live.
-        clock: time of the changes.
+        rig_name: name of the rig.
+        clock: clock for the instants of changes.
     """
 
     def __init__(self, store: Connection, rig_name: str, clock: Clock) -> None:
@@ -106,35 +106,43 @@ class ModelTable:
     # ---- models ------------------------------------------------------------------------------------------------------
 
     def all(self) -> list[ModelRow]:
-        """All models of the store, other rigs' too, oldest first."""
+        """Return all models of the store, including other rigs', oldest first."""
         return [_row(row) for row in self._store.rows(f"{_MODELS} ORDER BY model.id")]
 
     def get(self, model_id: object) -> ModelRow:
-        """The model of that number; NotInStoreError if there is none."""
+        """Return the model of that number.
+
+        Raises:
+            NotInStoreError: there is no such model.
+        """
         found = type(model_id) is int and self._store.rows(f"{_MODELS} WHERE model.id = ?", (model_id,))
         if not found:
             raise NotInStoreError(f"there is no model {model_id!r:.80}; `rigcal model list` shows them")
         return _row(found[0])
 
     def at(self, path: str) -> ModelRow:
-        """The model in a directory; NotInStoreError if there is none."""
+        """Return the model in a directory.
+
+        Raises:
+            NotInStoreError: there is no such model.
+        """
         found = self._store.rows(f"{_MODELS} WHERE model.path = ? ORDER BY model.id DESC LIMIT 1", (path,))
         if not found:
             raise NotInStoreError(f"there is no model at {path}; `rigcal model list` shows them")
         return _row(found[0])
 
     def live(self) -> ModelRow | None:
-        """The rig's live model."""
+        """Return the rig's live model; None if there is none."""
         found = self._store.rows(f"{_MODELS} WHERE model.rig = ? AND model.state = 'live'", (self._rig,))
         return _row(found[0]) if found else None
 
     def waiting(self) -> ModelRow | None:
-        """The rig's newest model, if it is a candidate."""
+        """Return the rig's newest model if it is a candidate, otherwise None."""
         found = self._store.rows(f"{_MODELS} WHERE model.rig = ? ORDER BY model.id DESC LIMIT 1", (self._rig,))
         return _row(found[0]) if found and found[0]["state"] == "candidate" else None
 
     def predecessor(self, model: ModelRow) -> int | None:
-        """The model that was live when this one was accepted; None for a first one."""
+        """Return the number of the model that was live when this one was accepted; None for the first model."""
         (first,) = self._store.rows(
             "SELECT replaced_id FROM model_states WHERE model_id = ? AND state = 'live' ORDER BY id LIMIT 1",
             (model.id,),
@@ -142,7 +150,7 @@ class ModelTable:
         return None if first["replaced_id"] is None else int(first["replaced_id"])
 
     def history(self, model: ModelRow) -> list[dict[str, Any]]:
-        """Every change of a model's state, oldest first."""
+        """Return every change of a model's state, oldest first."""
         return self._store.rows(
             "SELECT state, utc_ns, operator, caller_user AS user, reason, replaced_id FROM model_states "
             "WHERE model_id = ? ORDER BY id",
@@ -150,38 +158,44 @@ class ModelTable:
         )
 
     def jumped(self, model: ModelRow) -> dict[str, int]:
-        """Devices whose readings jumped since the model was trained, beyond the jumps that an operator has checked.
+        """Return the devices whose readings have jumped since the model was trained, without jumps that were checked.
 
-        What a session measured after a jump is in no model, so jumps count from the start of the newest session. What
-        came later is decided by boots and the monotonic clock: a wall clock may be wrong for whole boots.
+        No model uses what a session measured after a jump, so jumps are counted from the start of the newest session of
+        its training. Order of time is decided by boots and the monotonic clock, because the wall clock may be wrong for
+        whole boots.
 
         Returns:
-            device -> number of its newest jump among the store's device events.
+            Device -> number of its newest jump among the store's device events.
         """
         return lost_zeros(self._store, self._rig, self._sessions.newest_start(model.sessions))
 
     def time_axis(self) -> TimeAxis:
-        """The axis that `time_s` of the store's observations, and so of its models' training, lies on."""
+        """Return the axis of `time_s` in the store's observations, and so in its models' training data."""
         return time_axis(self._store)
 
     def live_run(self) -> LiveRun | None:
-        """The live model's run; None where none is live."""
+        """Return the live model's run; None if no model is live."""
         found = self._store.rows(_LIVE_RUN, (self._rig,))
         return LiveRun(**found[0]) if found else None
 
     def drifted(self, run: LiveRun) -> tuple[int, str] | None:
-        """Number and id of the check session by which a live model was found to have drifted; None before."""
+        """Return number and id of the check session that showed drift of a live model; None if none did."""
         found = self._store.rows(_DRIFTED, (run.since,))
         return (found[0]["number"], found[0]["id"]) if found else None
 
     def drift_checks(self, live_since: int) -> list[dict[str, Any]]:
-        """The check sessions held against a live model so far, and how its sums stand after each, oldest first."""
+        """Return the check sessions compared with a live model, and its cumulative sums after each, oldest first."""
         return self._store.rows(_DRIFT_CHECKS, (live_since,))
 
     # ---- changes -----------------------------------------------------------------------------------------------------
 
     def add(self, job_id: int, result: Mapping[str, Any]) -> None:
-        """Add the candidate that a job has made."""
+        """Add the candidate made by a job.
+
+        Args:
+            job_id: number of the job.
+            result: result of the job.
+        """
         row = {
             "rig": self._rig,
             "path": result["model"],
@@ -197,24 +211,24 @@ class ModelTable:
             self._note_state(model_id, "candidate", f"made by job {job_id}")
 
     def note_comparison(self, path: str, comparison: Mapping[str, Any]) -> None:
-        """Note how the model in a directory did on held-out sessions; an earlier comparison is replaced."""
+        """Store the figures on held-out sessions of the model in a directory; they replace an earlier comparison."""
         with self._store.transaction():
             for row in self._store.rows("SELECT id, metrics_json FROM models WHERE path = ?", (path,)):
                 metrics = json.loads(row["metrics_json"]) | {"comparison": comparison}
                 self._store.update("models", {"id": row["id"]}, {"metrics_json": metrics})
 
     def go_live(self, model: ModelRow, replaced: ModelRow | None, reason: str, **by: object) -> bool:
-        """Make a model the live one and retire the one before it.
+        """Make a model live and retire the previous live model.
 
         Args:
-            model: as it was when the decision was made.
-            replaced: the live model then.
+            model: the model, as it was when the decision was made.
+            replaced: the live model at that time.
             reason: why, a clause.
-            by: `operator`, and the columns of who gave the command.
+            by: `operator`, and the columns of the caller.
 
         Returns:
-            False, with nothing changed, if another model is live, or the model was compared anew or has changed its
-            state since.
+            False, with nothing changed, if a different model is live by now, or the model was compared again or has
+            changed its state since.
         """
         with self._store.transaction():
             now_live = self.live()
@@ -233,12 +247,12 @@ class ModelTable:
         """Retire a candidate that an operator does not want; it never goes live.
 
         Args:
-            model: as it was when the decision was made.
+            model: the model.
             reason: why, a clause.
-            by: as of `go_live`.
+            by: as for `go_live`.
 
         Returns:
-            False, with nothing changed, if it is no candidate any more.
+            False, with nothing changed, if the model is no longer a candidate.
         """
         with self._store.transaction():
             if self.get(model.id).state != "candidate":
@@ -248,20 +262,20 @@ class ModelTable:
         return True
 
     def was_live(self, model: ModelRow) -> bool:
-        """True if a model was ever the live one."""
+        """Return True if a model was ever live."""
         return any(change["state"] == "live" for change in self.history(model))
 
     def at_once(self) -> AbstractContextManager[object]:
-        """All that the block changes is stored together, or nothing of it."""
+        """Return a transaction: all changes in its block are stored together, or none."""
         return self._store.transaction()
 
     def note_zeros_checked(self, model: ModelRow, through: int, **by: object) -> None:
-        """Note that an operator has made sure that the joints' zeros are those that a model was trained with.
+        """Note that an operator has checked that the joints' zeros are those with which a model was trained.
 
         Args:
-            model: the live one, or one that waits.
-            through: number of the newest device event that was known then; jumps beyond it count.
-            by: as of `go_live`.
+            model: the live or the waiting model.
+            through: number of the newest device event known at that time; later jumps are not covered.
+            by: as for `go_live`.
         """
         self._note_state(model.id, model.state, "zeros checked", zeros_checked_through=through, **by)
 
@@ -270,12 +284,12 @@ class ModelTable:
         self._store.insert("model_states", row | self._store.instant(self._clock.now()))
 
     def add_drift_check(self, **columns: object) -> None:
-        """Add a check session that was held against a live model."""
+        """Add the comparison of a check session with a live model."""
         self._store.insert("drift_checks", columns | self._store.instant(self._clock.now()))
 
 
 def trained_on(models: Sequence[ModelRow | None]) -> frozenset[str]:
-    """Sessions that any of these models was trained on."""
+    """Return the sessions on which any of these models was trained."""
     return frozenset(session for model in models if model is not None for session in model.sessions)
 
 

@@ -1,4 +1,4 @@
-"""The table of notices: what each target was told of alarms, and what it is still to be told."""
+"""The table of notices: the sent and the pending notices of each target."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _MARK = """UPDATE notices SET sent_utc_ns = ?, sent_monotonic_ns = ?, sent_boot_
 
 
 class NoticeTable:
-    """The notices of a store, as rows: columns are those of `daemon.monitoring.notice.Notice`, with `at` and `raised`.
+    """The notices of a store, as rows with the columns of `daemon.monitoring.notice.Notice`, and `at` and `raised`.
 
     Args:
         store: the database.
@@ -32,23 +32,31 @@ class NoticeTable:
         self._store = store
 
     def transaction(self) -> AbstractContextManager[Database]:
-        """Several changes at once."""
+        """Return a transaction for several changes."""
         return self._store.transaction()
 
     def add(self, target: str, at: Stamp, raised: Stamp, sent: Stamp | None = None, **about: str) -> int:
-        """Add a notice for a target, one that was sent already if `sent` says when; its number."""
+        """Add a notice for a target, and return its number.
+
+        Args:
+            target: the target.
+            at: instant of the event.
+            raised: when the alarm was raised.
+            sent: when the notice was sent; None if it is pending.
+            about: further columns.
+        """
         row = {"target": target, **about, **self._store.instant(at), **self._store.instant(raised, "raised_")}
         if sent is not None:
             row |= self._store.instant(sent, "sent_")
         return self._store.insert("notices", row)
 
     def mark_sent(self, target: str, through: int, sent: Stamp) -> None:
-        """Note that a target was told of all that waited, up to a number."""
+        """Mark all pending notices of a target, up to number `through`, as sent."""
         with self._store.transaction() as db:
             db.execute(_MARK, [*self._store.instant(sent).values(), target, through])
 
     def waiting(self, target: str, since_utc_ns: int, most: int) -> list[dict[str, Any]]:
-        """The newest notices that a target is still to be told, oldest first; none where the table is damaged."""
+        """Return the newest pending notices of a target, oldest first; none if the table is damaged."""
         found = self._rows(_WAITING, target, since_utc_ns, most)
         return [*reversed(found)]
 
@@ -57,7 +65,7 @@ class NoticeTable:
         return self._rows(_UNCLEARED, target)
 
     def sent_since(self, target: str, since_utc_ns: int) -> list[int]:
-        """When a target was told something, UTC ns, oldest first."""
+        """Return when notices were sent to a target, UTC ns, oldest first."""
         sql = "SELECT DISTINCT sent_utc_ns FROM notices WHERE target = ? AND sent_utc_ns >= ? ORDER BY sent_utc_ns"
         rows: list[dict[str, Any]] = self._store.unless_damaged(
             lambda: self._store.rows(sql, (target, since_utc_ns)), []

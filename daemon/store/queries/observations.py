@@ -13,7 +13,7 @@ from drivers.clock import Stamp
 
 OF_CONTROL_POINT = "a control point, not the prism"  # why an observation must not be used
 
-# A control point is none of the rig's prisms, whatever is found of those later.
+# A control point is not a prism of the rig, so this reason is never replaced by later findings about prisms.
 _EXCLUDE = f"""UPDATE observations SET excluded = ? WHERE session_id = ? AND boot_id = ? AND monotonic_ns = ?
     AND excluded IS NOT '{OF_CONTROL_POINT}'"""
 _EXCLUDE_NEAR = f"""UPDATE observations SET excluded = '{OF_CONTROL_POINT}' WHERE session_id = ?1 AND excluded IS NULL
@@ -21,11 +21,11 @@ _EXCLUDE_NEAR = f"""UPDATE observations SET excluded = '{OF_CONTROL_POINT}' WHER
 _OBSERVATIONS = """SELECT session_id, setup_id, prism, pose, utc_ns, monotonic_ns, boot_id, x_mm, y_mm, z_mm,
         sigma_x_mm, sigma_y_mm, sigma_z_mm, dwell_s, values_json
     FROM observations WHERE excluded IS NULL AND session_id IN ({}) ORDER BY id"""
-# Fixes of a moving boom; those of poses leave them out, for that reason alone.
+# Fixes of a moving boom, which have no other reason for their exclusion.
 _MOVING = _OBSERVATIONS.replace("excluded IS NULL", "moving AND coalesce(excluded, 'moving') = 'moving'")
 _FIRST = """SELECT utc_ns, monotonic_ns, kernel_boot_id FROM observations JOIN boots ON boots.id = boot_id
     WHERE excluded IS NULL ORDER BY observations.id LIMIT 1"""
-# All that a station gave in a session from the last fix that calibration may use, or from the session's start.
+# A station's fixes in a session from the last one that calibration may use, or from the session's start.
 _FIXES = f"""SELECT fixes.* FROM calibration_sessions AS session CROSS JOIN boots CROSS JOIN fixes
     WHERE session.id = ?1 AND station = ?2
         AND {since("fixes.", ("session.started_boot_id", "session.started_monotonic_ns"))}
@@ -33,7 +33,7 @@ _FIXES = f"""SELECT fixes.* FROM calibration_sessions AS session CROSS JOIN boot
             WHERE session_id = ?1 AND excluded IS NULL AND used.station = ?2), 0)
     ORDER BY fixes.id"""
 
-# The oldest fix of each station that is of the prism, as far as is known, and says its prism constant.
+# Each station's oldest fix that is of the prism, as far as is known, and contains a prism constant.
 _FIRST_CONSTANTS = """SELECT fixes.station, fixes.prism_constant_mm, min(observations.id) AS oldest
     FROM observations JOIN fixes ON fixes.id = fix_id
     WHERE session_id = ? AND prism_constant_mm IS NOT NULL AND excluded IS NULL GROUP BY station"""
@@ -50,7 +50,7 @@ class ObservationTable:
         self._store = store
 
     def add(self, fix_id: int | None, measured: Stamp, **columns: object) -> None:
-        """Add an observation that a fix gives."""
+        """Add the observation of a fix."""
         self._store.insert("observations", {**columns, "fix_id": fix_id, **self._store.instant(measured)})
 
     def exclude(self, session_id: str, exclusions: Mapping[int, str | None], newest: Stamp) -> None:
@@ -58,8 +58,8 @@ class ObservationTable:
 
         Args:
             session_id: the session.
-            exclusions: instant of a fix, monotonic ns -> why calibration must not use it, None when it may.
-            newest: instant of the newest fix; the others are of its boot.
+            exclusions: instant of a fix, monotonic ns -> why calibration must not use it; None if it may.
+            newest: instant of the newest fix; all fixes are of its boot.
         """
         with self._store.transaction() as db:
             boot = self._store.boot_row(newest)
@@ -67,7 +67,7 @@ class ObservationTable:
             db.conn.executemany(_EXCLUDE, rows)
 
     def exclude_near(self, session_id: str, point_mm: Sequence[float], radius_mm: float) -> None:
-        """Exclude the observations of a session that lie near a control point and might have been used."""
+        """Exclude the observations of a session that lie near a control point and are not excluded yet."""
         with self._store.transaction() as db:
             db.conn.execute(_EXCLUDE_NEAR, (session_id, *point_mm, radius_mm))
 
@@ -81,12 +81,17 @@ def observations(source: RowSource, session_ids: Sequence[str]) -> list[dict[str
 
 
 def moving_observations(source: RowSource, session_ids: Sequence[str]) -> list[dict[str, Any]]:
-    """Return the observations of sessions that were made while the boom moved and have no other fault."""
+    """Return the observations of sessions that were measured while the boom moved and have no other fault."""
     return list(source.rows(_MOVING.format(marks(session_ids)), session_ids))
 
 
 def all_observations(source: RowSource, session_ids: Sequence[str] = ()) -> list[dict[str, Any]]:
-    """Return the observations of sessions, or of all, oldest first, used or excluded; joints and signals as columns."""
+    """Return used and excluded observations of some or all sessions, oldest first; joints and signals as columns.
+
+    Args:
+        source: the store.
+        session_ids: the sessions; empty for all.
+    """
     where = f"WHERE session_id IN ({marks(session_ids)})" if session_ids else ""
     rows = source.rows(
         "SELECT session_id, setup_id, prism, pose, utc_ns, x_mm, y_mm, z_mm, sigma_x_mm, sigma_y_mm, sigma_z_mm, "
@@ -102,10 +107,10 @@ def first_observation(source: RowSource) -> dict[str, Any] | None:
 
 
 def first_constants_mm(source: RowSource, session_id: str) -> dict[str, float]:
-    """Return the prism constants that stations applied to their first fixes of a session that are used.
+    """Return the prism constants that stations applied to their first used fixes in a session.
 
     Returns:
-        station -> constant, mm.
+        Station -> constant, mm.
     """
     rows = source.rows(_FIRST_CONSTANTS, (session_id,))
     return {row["station"]: row["prism_constant_mm"] for row in rows}

@@ -1,4 +1,4 @@
-"""The tables of calibration sessions: sessions, confirmations of their prism, and encoder jumps."""
+"""The tables of calibration sessions: sessions, their control shots, and confirmations of their prism."""
 
 from __future__ import annotations
 
@@ -17,12 +17,11 @@ from daemon.store.rows import RowSource, marks
 from daemon.store.views import in_session
 from drivers.clock import NS_PER_S, Stamp
 
-BEFORE_NS = 60 * NS_PER_S  # dwell and direction of a session's first fixes come from motion before it
-AFTER_NS = 2 * NS_PER_S  # its last fixes are interpolated between joints
-CLOCK_STEP_NS = NS_PER_S // 20  # less may be the time between reading the one clock and the other
+BEFORE_NS = 60 * NS_PER_S  # dwell and direction of a session's first fixes depend on motion before it
+AFTER_NS = 2 * NS_PER_S  # a session's last fixes are interpolated between joint readings up to this time after it
+CLOCK_STEP_NS = NS_PER_S // 20  # a smaller difference may be the time between reading the two clocks
 
-# Fixes of these may still come: of the open ones, and of those that ended after the oldest capture that waits to be
-# decoded was made.
+# Sessions that may still get fixes: open ones, and those that ended after the oldest capture that waits to be decoded.
 _IS_UNDECODED = f"(ended_boot_id, ended_monotonic_ns) >= ({OLDEST_WAITING})"
 _UNFINISHED = f"SELECT * FROM calibration_sessions WHERE state = 'open' OR {_IS_UNDECODED} ORDER BY rowid"
 _SUMMARY = """SELECT id, rig, setup_id AS setup, prism, operator, caller_user AS user, kind, state, note,
@@ -45,12 +44,13 @@ _INSTANTS = """WITH instants AS (
         UNION ALL SELECT * FROM (SELECT ended_boot_id, ended_monotonic_ns, ended_utc_ns, 1 FROM calibration_sessions
             WHERE ended_utc_ns IS NOT NULL AND rowid < (SELECT rowid FROM calibration_sessions WHERE id = ?1)
             ORDER BY rowid DESC LIMIT 1))"""
-# So begins why a session is not used that was recorded with another rig file, or before a joint's zero was lost.
+# Prefixes of the reason why a session is not used: it was recorded with a different rig file, or before a joint's zero
+# was lost. Stored reasons are compared with these prefixes, so they must not change.
 OTHER_RIG_FILE = "it was recorded with another rig file: "
 ZERO_LOST = "an encoder has jumped since, and nobody has checked its zero: "
-# Within a boot both clocks run alike, whatever NTP does to their rate: their difference changes only when the clock is
-# set. A later boot must not show an earlier time. Since the end of the session before only what was set back counts: a
-# computer that slept meanwhile is ahead. The first query is cheap, and nearly always the answer.
+# Within a boot both clocks run at the same rate, whatever NTP does, so their difference changes only when the clock is
+# set. A later boot must not show an earlier time. For the time since the end of the previous session only backward
+# steps count, because a computer that was suspended is ahead. The first query is cheap and nearly always sufficient.
 _MAY_HAVE_STEPPED = f"""{_INSTANTS} SELECT min(boot_id) < max(boot_id)
         OR max(utc_ns - monotonic_ns) - min(utc_ns - monotonic_ns) >= {CLOCK_STEP_NS} AS maybe FROM instants"""
 _CLOCK_STEPS = f"""{_INSTANTS},
@@ -65,7 +65,7 @@ _CLOCK_STEPS = f"""{_INSTANTS},
     SELECT utc_ns AS at_utc_ns, step_ns FROM steps WHERE abs(step_ns) >= {CLOCK_STEP_NS}"""
 _CLOCKS = """SELECT phase, synchronized AS is_synchronized, offset_s, max_error_s, source, error
     FROM session_clocks WHERE session_id = ?"""
-# Poses, and those between two shots of a control point. Where the boom moves, each observation is a pose of its own.
+# Poses, and poses between two shots of a control point. While the boom moves, each observation counts as one pose.
 _ENCLOSED = """SELECT count(DISTINCT coalesce(o.pose, o.id)) AS poses,
         count(DISTINCT CASE WHEN EXISTS (SELECT 1 FROM control_shots AS a JOIN control_shots AS b
                 ON b.session_id = a.session_id AND b.name = a.name AND b.phase = 'end'
@@ -74,7 +74,7 @@ _ENCLOSED = """SELECT count(DISTINCT coalesce(o.pose, o.id)) AS poses,
                 AND (o.boot_id, o.monotonic_ns) < (b.boot_id, b.monotonic_ns))
             THEN coalesce(o.pose, o.id) END) AS enclosed
     FROM observations AS o WHERE o.session_id = ? AND o.excluded IS NULL"""
-# A pose after the first shot of all that no shot of a point which was shot again at the end came before.
+# A pose after the session's first shot, but before any shot of a control point that was shot again at the end.
 _BEFORE_ENCLOSED = """SELECT 1 FROM observations AS o WHERE o.session_id = ?1 AND o.excluded IS NULL
         AND EXISTS (SELECT 1 FROM control_shots AS s WHERE s.session_id = ?1 AND s.phase = 'start'
             AND (s.boot_id, s.monotonic_ns) < (o.boot_id, o.monotonic_ns))
@@ -82,8 +82,8 @@ _BEFORE_ENCLOSED = """SELECT 1 FROM observations AS o WHERE o.session_id = ?1 AN
                 ON b.session_id = ?1 AND b.name = a.name AND b.phase = 'end'
             WHERE a.session_id = ?1 AND a.phase = 'start'
                 AND (a.boot_id, a.monotonic_ns) < (o.boot_id, o.monotonic_ns)) LIMIT 1"""
-# How far apart a control point's shots lie between which there are poses. Of shots without poses in between the last
-# one counts: it was made because the one before was no good.
+# Largest distance between shots of a control point with poses in between. Of successive shots without poses in between
+# the last one is used, because it was repeated after a bad shot.
 _MOVED_BETWEEN = """WITH counted AS (SELECT s.id, s.name, s.x_mm, s.y_mm, s.z_mm FROM control_shots AS s
         WHERE s.session_id = ?1 AND NOT EXISTS (SELECT 1 FROM control_shots AS c
             WHERE c.session_id = ?1 AND c.name = s.name AND c.id > s.id AND NOT EXISTS (SELECT 1 FROM observations AS o
@@ -96,14 +96,14 @@ _MOVED_BETWEEN = """WITH counted AS (SELECT s.id, s.name, s.x_mm, s.y_mm, s.z_mm
 _BETWEEN = """SELECT 1 FROM observations AS o JOIN control_shots AS c ON c.session_id = o.session_id AND c.name = ?
     WHERE o.session_id = ? AND o.excluded IS NULL
         AND (o.boot_id, o.monotonic_ns) > (c.boot_id, c.monotonic_ns) LIMIT 1"""
-# The newest fix of each standstill, by session, from an instant on.
+# The newest observation of each standstill, by session, from an instant on.
 _STANDSTILLS = """SELECT max(o.id) AS id, o.session_id, o.prism, o.x_mm, o.y_mm, o.z_mm, o.values_json
     FROM calibration_sessions AS s JOIN observations AS o ON o.session_id = s.id
     WHERE s.setup_id = ? AND s.rig = ? AND s.state != 'aborted' AND o.excluded IS NULL AND o.pose IS NOT NULL
         AND coalesce(s.excluded, '') NOT LIKE ?
         AND (o.boot_id, o.monotonic_ns) >= (?, ?)
     GROUP BY o.session_id, o.pose ORDER BY id DESC LIMIT 500"""
-# Those after the newest session that is used: later measurements make up for the earlier ones.
+# Sessions after the newest used session; later measurements replace earlier ones.
 _UNTRAINED = f"""SELECT id, excluded FROM calibration_sessions
     WHERE rig = ?1 AND state = 'closed' AND excluded IS NOT NULL AND excluded NOT LIKE '{OTHER_RIG_FILE}%'
         AND excluded NOT LIKE '{ZERO_LOST}%' AND rowid >
@@ -115,7 +115,7 @@ _WITH_RIG = """SELECT calibration_sessions.*, rig_files.text AS rig_text FROM ca
 _SESSION = f"{_WITH_RIG} WHERE id = ?"
 _BETWEEN_INSTANTS = f"""{_WITH_RIG} WHERE (started_boot_id, started_monotonic_ns) <= (?, ?)
         AND (ended_boot_id IS NULL OR (ended_boot_id, ended_monotonic_ns) >= (?, ?))"""
-# What was measured from a session's start to its end; the index of the table behind the view finds it.
+# Rows measured from a session's start to its end, found by the index of the table behind the view.
 _FIXES_MEASURED = f"""SELECT row.* {in_session("links CROSS JOIN v_fixes")} AND row.station = links.name
     ORDER BY row.id"""
 _JOINTS_MEASURED = f"SELECT row.* {in_session('v_joints')} ORDER BY row.boot_id, row.monotonic_ns"
@@ -128,9 +128,9 @@ class OpenSessionRow:
     """The open session.
 
     Attributes:
-        id: of the session.
+        id: id of the session.
         started: when it was opened.
-        jumped: devices whose encoders have jumped since, by name.
+        jumped: names of the devices whose encoders have jumped since.
     """
 
     id: str
@@ -143,7 +143,7 @@ class SessionTable:
 
     Args:
         store: the database.
-        rig_name: whose sessions are opened and used.
+        rig_name: name of the rig.
     """
 
     def __init__(self, store: Connection, rig_name: str) -> None:
@@ -152,35 +152,35 @@ class SessionTable:
     # ---- sessions ----------------------------------------------------------------------------------------------------
 
     def ids(self) -> set[str]:
-        """All sessions of the store."""
+        """Return the ids of all sessions in the store."""
         return {row["id"] for row in self._store.rows("SELECT id FROM calibration_sessions")}
 
     def free_id(self, prism: str) -> str:
-        """A name that no session has."""
+        """Return an unused id for a session of a prism."""
         taken = self.ids()
         return next(name for n in itertools.count(len(taken) + 1) if (name := f"s{n:03d}-{prism}") not in taken)
 
     def summary(self, session_id: str) -> dict[str, Any]:
-        """One session: its observations, those that were excluded and why, and whether calibration uses it.
+        """Return a summary of one session: its observations, exclusions with reasons, and whether calibration uses it.
 
         Raises:
-            NotInStoreError: there is none.
+            NotInStoreError: there is no such session.
         """
         with self._store.reader() as reader:
             return _summary(reader, session_id)
 
     def all(self) -> list[dict[str, Any]]:
-        """All summaries, oldest first. Read beside the writing connection, which must not wait."""
+        """Return all summaries, oldest first, read on a separate connection so that the writing one does not wait."""
         with self._store.reader() as reader:
             ids = [row["id"] for row in reader.rows("SELECT id FROM calibration_sessions ORDER BY rowid")]
             return [_summary(reader, session_id) for session_id in ids]
 
     def unfinished(self) -> list[dict[str, Any]]:
-        """Rows of the sessions that may still get fixes: open ones, and those with captures that wait to be decoded."""
+        """Return the sessions that may still get fixes: open ones, and those whose captures are not all decoded."""
         return self._store.rows(_UNFINISHED)
 
     def open_session(self) -> OpenSessionRow | None:
-        """The rig's open session; None without one."""
+        """Return the rig's open session; None without one."""
         rows = self._store.rows(_OPEN, (self._rig,))
         if not rows:
             return None
@@ -189,7 +189,7 @@ class SessionTable:
         return OpenSessionRow(rows[0]["id"], started, tuple(sorted({jump.device for jump in jumps})))
 
     def used(self) -> list[dict[str, Any]]:
-        """Id and kind of the rig's closed sessions that calibration may use, oldest first."""
+        """Return id and kind of the rig's closed sessions that calibration may use, oldest first."""
         return self._store.rows(
             "SELECT id, kind FROM calibration_sessions WHERE rig = ? AND state = 'closed' AND excluded IS NULL "
             "ORDER BY rowid",
@@ -197,32 +197,32 @@ class SessionTable:
         )
 
     def used_like(self, session_id: str) -> str | None:
-        """The newest other session that calibration may use, of the same prism in the same set-up."""
+        """Return the newest other session of the same prism in the same set-up that calibration may use, if any."""
         sql = """SELECT other.id FROM calibration_sessions AS own JOIN calibration_sessions AS other
                 ON other.setup_id = own.setup_id AND other.prism = own.prism AND other.id <> own.id
             WHERE own.id = ? AND other.state = 'closed' AND other.excluded IS NULL ORDER BY other.rowid DESC LIMIT 1"""
         return next((row["id"] for row in self._store.rows(sql, (session_id,))), None)
 
     def closed(self) -> list[dict[str, Any]]:
-        """Id, excluded and accepted_despite of the rig's closed sessions, oldest first."""
+        """Return id, excluded and accepted_despite of the rig's closed sessions, oldest first."""
         sql = """SELECT id, excluded, accepted_despite FROM calibration_sessions
             WHERE rig = ? AND state = 'closed' ORDER BY rowid"""
         return self._store.rows(sql, (self._rig,))
 
     def untrained(self) -> dict[str, str]:
-        """Closed sessions of the rig that calibration does not use, newer than all that it uses -> why.
+        """Return the rig's closed sessions newer than all used ones that calibration does not use -> why.
 
-        Those that were recorded with another rig file, or before a joint's zero was lost, are history, and left out.
+        Sessions recorded with a different rig file, or before a joint's zero was lost, are left out as outdated.
         """
         return {row["id"]: row["excluded"] for row in self._store.rows(_UNTRAINED, (self._rig,))}
 
     def newest_number(self) -> int:
-        """Number of the rig's newest session; 0 before the first."""
+        """Return the number of the rig's newest session; 0 before the first."""
         sql = "SELECT coalesce(max(rowid), 0) FROM calibration_sessions WHERE rig = ?"
         return self._store.number(sql, (self._rig,)) or 0
 
     def newest_start(self, session_ids: Collection[str]) -> Stamp | None:
-        """When the newest of some sessions was started; None without any of them."""
+        """Return when the newest of some sessions was started; None if there is none."""
         rows = self._store.rows(
             "SELECT id, started_utc_ns, started_monotonic_ns, started_boot_id FROM calibration_sessions WHERE rig = ? "
             "ORDER BY rowid DESC",
@@ -231,7 +231,7 @@ class SessionTable:
         return next((self._store.stamp(row, "started_") for row in rows if row["id"] in session_ids), None)
 
     def zeros_lost(self) -> list[str]:
-        """Devices whose encoder has jumped since the zeros of the newest closed session were known, and not checked."""
+        """Return devices with an unchecked encoder jump since the newest closed session was started or accepted."""
         sql = """SELECT started_utc_ns, started_monotonic_ns, started_boot_id,
                 accepted_utc_ns, accepted_monotonic_ns, accepted_boot_id
             FROM calibration_sessions WHERE rig = ? AND state = 'closed' ORDER BY rowid DESC LIMIT 1"""
@@ -239,16 +239,16 @@ class SessionTable:
         return [*lost_zeros(self._store, self._rig, self.zeros_known(rows[0]))] if rows else []
 
     def zeros_known(self, session: Mapping[str, Any]) -> Stamp:
-        """Return when the zeros of a session were the present ones: at its start, or when an operator accepted it."""
+        """Return when the zeros of a session were last known: at its start, or when an operator accepted it."""
         return self._store.stamp_or_none(session, "accepted_") or self._store.stamp(session, "started_")
 
     def rig_of(self, session_ids: Sequence[str]) -> str | None:
-        """SHA-256 of the rig file of the newest of some sessions; None without any of them."""
+        """Return the SHA-256 of the rig file of the newest of some sessions; None if there is none."""
         sql = f"SELECT rig_sha256 FROM calibration_sessions WHERE id IN ({marks(session_ids)}) ORDER BY rowid DESC"
         return next((row["rig_sha256"] for row in self._store.rows(sql, session_ids)), None)
 
     def state_and_exclusion(self, session_id: str) -> tuple[str, str | None]:
-        """State of a session, and why calibration does not use it, None where it may.
+        """Return the state of a session, and why calibration does not use it; None if it may.
 
         Raises:
             NotInStoreError: there is no such session.
@@ -259,14 +259,20 @@ class SessionTable:
         return found[0]["state"], found[0]["excluded"]
 
     def start(self, started: Stamp, rig_text: str, **columns: object) -> None:
-        """Add an open session of the rig, which its file describes."""
+        """Add an open session of the rig.
+
+        Args:
+            started: start of the session.
+            rig_text: the rig file.
+            columns: further columns of its row.
+        """
         row = {**columns, "rig": self._rig, "state": "open", **self._store.instant(started, "started_")}
         with self._store.transaction():
             sha256 = self._store.rig_file(self._rig, rig_text)
             self._store.insert("calibration_sessions", {**row, "rig_sha256": sha256})
 
     def note_clock(self, session_id: str, phase: str, state: ClockState) -> None:
-        """Add how the computer's clock is at a session's `start` or `end`."""
+        """Store the state of the computer's clock at a session's `start` or `end`."""
         told = asdict(state)
         row = {"session_id": session_id, "phase": phase, "synchronized": told.pop("is_synchronized"), **told}
         self._store.insert("session_clocks", row)
@@ -276,57 +282,57 @@ class SessionTable:
         self._store.update("calibration_sessions", {"id": session_id}, columns)
 
     def exclude_closed(self, session_id: str, excluded: str | None) -> None:
-        """Change why calibration must not use a session, if it is closed and no operator has accepted it."""
+        """Set why calibration must not use a session, if it is closed and no operator has accepted it."""
         closed = {"id": session_id, "state": "closed", "accepted_despite": None}
         self._store.update("calibration_sessions", closed, {"excluded": excluded})
 
     # ---- control shots -----------------------------------------------------------------------------------------------
 
     def phase(self, session_id: str, point: str) -> str:
-        """Return `end` for a control point that was shot before the observations so far, else `start`."""
+        """Return `end` for a control point that has a shot before some of the session's observations, else `start`."""
         return "end" if self._store.rows(_BETWEEN, (point, session_id)) else "start"
 
     def points_shot(self, session_id: str, phase: str) -> set[str]:
-        """Control points that were shot in a phase of a session."""
+        """Return the control points that were shot in a phase of a session."""
         return {shot["point"] for shot in self.shots(session_id) if shot["phase"] == phase}
 
     def shots(self, session_id: str) -> list[dict[str, Any]]:
-        """Point, phase and misclosure_mm of a session's control shots, oldest first."""
+        """Return point, phase and misclosure_mm of a session's control shots, oldest first."""
         return self._store.rows(_SHOTS, (session_id,))
 
     def moved_between(self, session_id: str) -> tuple[str, float] | None:
-        """The control point that moved most between two shots with poses in between, and by how many mm, if any."""
+        """Return the control point that moved most between shots with poses in between, and how far, mm; or None."""
         (found,) = self._store.rows(_MOVED_BETWEEN, (session_id,))
         return None if found["point"] is None else (found["point"], math.sqrt(found["square_mm2"]))
 
     def has_poses_before_enclosed(self, session_id: str) -> bool:
-        """True if poses lie after a session's first shot and before any of a point that was shot again at the end."""
+        """Return True if a pose follows the first shot but precedes all shots of points shot again at the end."""
         return bool(self._store.rows(_BEFORE_ENCLOSED, (session_id,)))
 
     def count_poses(self, session_id: str) -> tuple[int, int]:
-        """Number of poses of a session, and of those that lie between two shots of a control point."""
+        """Return the number of a session's poses, and of those between two shots of a control point."""
         (found,) = self._store.rows(_ENCLOSED, (session_id,))
         return found["poses"], found["enclosed"]
 
     # ---- their prism ------------------------------------------------------------------------------------------------
 
     def standstill_observations(self, setup_id: str, since: Stamp | None) -> list[dict[str, Any]]:
-        """The newest observation of each standstill at a set-up that calibration may use, oldest first.
+        """Return the newest used observation of each standstill in a set-up, oldest first.
 
-        Those of sessions that were recorded with another rig file are left out.
+        Sessions that were recorded with a different rig file are left out.
 
         Args:
-            setup_id: of the station.
-            since: earlier ones do not count; all do when None.
+            setup_id: set-up of the station.
+            since: earlier observations are left out; None for no limit.
 
         Returns:
-            session_id, prism, x_mm, y_mm, z_mm and values_json, at most 500 of them.
+            session_id, prism, x_mm, y_mm, z_mm and values_json of each, at most 500.
         """
         first = (0, 0) if since is None else self._store.order(since)
         return self._store.rows(_STANDSTILLS, (setup_id, self._rig, f"{OTHER_RIG_FILE}%", *first))[::-1]
 
     def add_confirmation(self, session_id: str, at: Stamp, **columns: object) -> None:
-        """Add a word that the session's stations are on its prism: `operator` and caller, or `turning`."""
+        """Add a confirmation that the session's stations are on its prism: with `operator` and caller, or `turning`."""
         row = {"session_id": session_id, **self._store.instant(at), **columns}
         self._store.insert("prism_confirmations", row)
 
@@ -335,18 +341,18 @@ class SessionTable:
 
 
 def session(source: RowSource, session_id: str) -> dict[str, Any] | None:
-    """Return a session's row with its `rig_text`; None where there is none."""
+    """Return a session's row with its `rig_text`; None if there is no such session."""
     return next(iter(source.rows(_SESSION, (session_id,))), None)
 
 
 def sessions_between(source: RowSource, since: Stamp, until: Stamp, boot: int) -> list[dict[str, Any]]:
-    """Return the rows of sessions, as `session` does, that were open between two instants of a boot.
+    """Return the rows of sessions, in the form of `session`, that were open between two instants of a boot.
 
     Args:
         source: the store.
         since: the first instant.
-        until: the last one.
-        boot: number of the row of `boots`.
+        until: the last instant.
+        boot: row of `boots`.
     """
     first, last = (boot, since.monotonic_ns), (boot, until.monotonic_ns)
     return list(source.rows(_BETWEEN_INSTANTS, (*last, *first)))
@@ -363,7 +369,7 @@ def all_sessions(source: RowSource) -> list[dict[str, Any]]:
 
 
 def sessions_of_use(source: RowSource) -> tuple[list[str], list[str]]:
-    """Return the closed sessions that calibration may use, oldest first: those that train, and check sessions."""
+    """Return the closed sessions that calibration may use, oldest first: training sessions and check sessions."""
     rows = source.rows(
         "SELECT id, kind FROM calibration_sessions WHERE state = 'closed' AND excluded IS NULL ORDER BY rowid"
     )
@@ -372,7 +378,7 @@ def sessions_of_use(source: RowSource) -> tuple[list[str], list[str]]:
 
 
 def prism_confirmations(source: RowSource, session_id: str) -> list[dict[str, Any]]:
-    """Return the rows of words that a session's stations are on its prism, oldest first."""
+    """Return the confirmations that a session's stations are on its prism, oldest first."""
     return list(source.rows("SELECT * FROM prism_confirmations WHERE session_id = ? ORDER BY id", (session_id,)))
 
 
@@ -408,7 +414,7 @@ def _summary(source: RowSource, session_id: str) -> dict[str, Any]:
 
 
 def _clocks(source: RowSource, session_id: str) -> dict[str, dict[str, Any] | None]:
-    """Return how the computer's clock was at a session's start and end; None where that was not noted."""
+    """Return the state of the computer's clock at a session's start and end; None where it was not stored."""
     found: dict[str, dict[str, Any] | None] = {"start": None, "end": None}
     for row in source.rows(_CLOCKS, (session_id,)):
         phase, flag = row.pop("phase"), row["is_synchronized"]
@@ -417,7 +423,7 @@ def _clocks(source: RowSource, session_id: str) -> dict[str, dict[str, Any] | No
 
 
 def _clock_steps(source: RowSource, session_id: str) -> list[dict[str, Any]]:
-    """Return when the computer's clock was set during a session or back before it, and by how much."""
+    """Return when and by how much the computer's clock was set during a session, or set back before it."""
     (found,) = source.rows(_MAY_HAVE_STEPPED, (session_id,))
     if not found["maybe"]:
         return []

@@ -1,4 +1,4 @@
-"""The tables of station set-ups: where a total station stands, its control points, and the shots of these."""
+"""The tables of station set-ups: where a total station stands, its control points, and their shots."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _OF_SESSIONS = """SELECT id, instrument, state FROM station_setups
 _MISCLOSURES = """SELECT s.name, s.phase, s.x_mm - p.x_mm AS x, s.y_mm - p.y_mm AS y, s.z_mm - p.z_mm AS z
     FROM control_shots AS s JOIN control_points AS p ON p.setup_id = s.setup_id AND p.name = s.name
     WHERE s.setup_id = ? AND s.session_id IN ({}) ORDER BY s.id"""
-# What names a set-up: its description, a guide, a session. That which is open counts before what came after it.
+# A set-up is named by its description, a guide or a session. An open guide or session takes precedence over later ones.
 _CURRENT = """WITH named AS (
         SELECT * FROM (SELECT id AS setup_id, 0 AS is_open, created_boot_id AS boot, created_monotonic_ns AS at
             FROM station_setups ORDER BY rowid DESC LIMIT 1)
@@ -37,7 +37,7 @@ class SetupRow:
     """A station set-up.
 
     Attributes:
-        id: of the set-up.
+        id: name of the set-up.
         state: ok, moved or closed.
     """
 
@@ -50,44 +50,44 @@ class SetupTable:
 
     Args:
         store: the database.
-        rig_name: whose sessions and guides tell where the station stands.
+        rig_name: name of the rig, whose sessions and guides show where the station stands.
     """
 
     def __init__(self, store: Connection, rig_name: str) -> None:
         self._store, self._rig = store, rig_name
 
     def all(self) -> list[dict[str, Any]]:
-        """All set-ups with their control points, oldest first."""
+        """Return all set-ups with their control points, oldest first."""
         setups = self._store.rows(
             "SELECT id, instrument, serial, tilt_arcsec, ppm, state, note FROM station_setups ORDER BY rowid"
         )
         return [setup | {"control_points": control_points(self._store, setup["id"])} for setup in setups]
 
     def states(self) -> dict[str, str]:
-        """The state of each set-up, oldest first."""
+        """Return the state of each set-up, oldest first."""
         rows = self._store.rows("SELECT id, state FROM station_setups ORDER BY rowid")
         return {row["id"]: row["state"] for row in rows}
 
     def constants_mm(self, setup_id: str) -> dict[str, float]:
-        """The prism constants that a set-up's description gives, by the prisms' names."""
+        """Return prism -> constant, mm, from a set-up's description."""
         rows = self._store.rows("SELECT prism_constants_json FROM station_setups WHERE id = ?", (setup_id,))
         return {prism: mm for row in rows for prism, mm in json.loads(row["prism_constants_json"]).items()}
 
     def current(self) -> SetupRow | None:
-        """The set-up that the station stands in; None before the first.
+        """Return the set-up that the station stands in; None before the first.
 
-        That of the open session or guide, else the one that was described, or used for a session, last.
+        This is the set-up of the open session or guide, or else the one last described or used for a session or guide.
         """
         found = self._store.rows(_CURRENT, (self._rig,))
         return SetupRow(**found[0]) if found else None
 
     def point_shots(self, setup_id: str, name: str) -> list[dict[str, Any]]:
-        """Session, phase and misclosure_mm of a control point's shots."""
+        """Return session, phase and misclosure_mm of a control point's shots."""
         sql = "SELECT session_id, phase, misclosure_mm FROM control_shots WHERE setup_id = ? AND name = ?"
         return self._store.rows(sql, (setup_id, name))
 
     def current_shots(self) -> list[dict[str, Any]]:
-        """The newest shot of each control point of the current set-up: setup, point, session, phase, misclosure_mm."""
+        """Return the newest shot of each control point of the current set-up."""
         current = self.current()
         return [] if current is None else self._store.rows(_NEWEST_SHOTS, (current.id,))
 
@@ -96,7 +96,7 @@ class SetupTable:
         self._store.insert("station_setups", {**columns, "state": "ok", **self._store.instant(created, "created_")})
 
     def put_control_point(self, setup_id: str, name: str, place: Mapping[str, float]) -> None:
-        """Add a control point, or change where it is: `x_mm`, `y_mm` and `z_mm`."""
+        """Add a control point, or change its place: `x_mm`, `y_mm` and `z_mm`."""
         key = {"setup_id": setup_id, "name": name}
         if not self._store.update("control_points", key, place):
             self._store.insert("control_points", {**key, **place})
@@ -107,7 +107,7 @@ class SetupTable:
         self._store.insert("control_shots", row)
 
     def mark_moved(self, setup_id: str) -> None:
-        """Note that a set-up has moved: a control point is not where it was."""
+        """Mark a set-up as moved: a control point is not where it was."""
         self._store.update("station_setups", {"id": setup_id}, {"state": "moved"})
 
 
@@ -115,7 +115,7 @@ class SetupTable:
 
 
 def control_points(source: RowSource, setup_id: str) -> list[dict[str, Any]]:
-    """Return name, x_mm, y_mm and z_mm of a set-up's control points, in the order they were defined."""
+    """Return name, x_mm, y_mm and z_mm of a set-up's control points, in the order of definition."""
     return list(source.rows(_POINTS, (setup_id,)))
 
 
@@ -128,6 +128,6 @@ def misclosures(source: RowSource, setup_id: str, session_ids: Sequence[str]) ->
     """Return the shots of a set-up's control points in some sessions, oldest first.
 
     Returns:
-        name, phase, and x, y, z: how far off the point's known place it was, mm in the station's frame.
+        name, phase, and x, y, z: offset from the point's known place, mm in the station's frame.
     """
     return list(source.rows(_MISCLOSURES.format(marks(session_ids)), (setup_id, *session_ids)))

@@ -1,11 +1,11 @@
-"""One axis of time for all that a store has observed, whatever the computer's clock was set to meanwhile.
+"""A single time axis for all observations of a store, independent of settings of the computer's clock.
 
-Within a boot, time passes as the monotonic clock says. From the last observation of a boot to the first one of the next
-it passes as the computer's clock says, and not at all where that shows an earlier time.
+Within a boot, time follows the monotonic clock. From the last observation of a boot to the first of the next boot it
+follows the computer's clock, and stands still if that shows an earlier time.
 
-Any clock may be wrong. A boot is timed by what the clock showed at its first observation and by what it showed at its
-last one; the end of a boot also by the latest time of the boots before. The least time between two boots by any of
-these counts: so a clock that is wrong in a part of a boot moves no later boot far.
+Any clock may be wrong. A boot is dated by the clock at its first observation and at its last one; the end of a boot is
+also dated by the latest time of earlier boots. The shortest time between two boots by any of these is used, so that a
+clock that is wrong during part of a boot does not move later boots far.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from drivers.clock import NS_PER_S, Stamp
 
 SET_SINCE_NS = 1_577_836_800 * NS_PER_S  # 2020: a clock that shows an earlier time is not set
 
-# SQLite takes the other columns from the row that has the least or the greatest one.
+# With min() or max() SQLite takes the other columns from the row of the smallest or largest value.
 _BOOTS = """WITH firsts AS (SELECT boot_id, min(monotonic_ns) AS first_ns, utc_ns AS first_utc_ns FROM observations
             GROUP BY boot_id),
         lasts AS (SELECT boot_id, max(monotonic_ns) AS last_ns, utc_ns AS last_utc_ns FROM observations
@@ -30,13 +30,13 @@ _BOOTS = """WITH firsts AS (SELECT boot_id, min(monotonic_ns) AS first_ns, utc_n
 
 @dataclass(frozen=True)
 class TimeAxis:
-    """The axis that `time_s` of observations lies on: seconds since the first one that calibration may use.
+    """The axis of `time_s` of observations: seconds since the first observation that calibration may use.
 
     Attributes:
-        offsets_ns: boot -> what its monotonic clock lacks to the axis.
-        end_ns: of the newest observation, on the axis.
-        ends_utc_ns: UTC then, by each clock that may be right.
-        shown_ns: UTC that the computer's clock showed then.
+        offsets_ns: boot -> offset to add to its monotonic clock.
+        end_ns: instant of the newest observation on the axis.
+        ends_utc_ns: UTC at that instant, by each clock that may be right.
+        shown_ns: UTC that the computer's clock showed at that instant.
     """
 
     offsets_ns: dict[str, int]
@@ -45,14 +45,14 @@ class TimeAxis:
     shown_ns: int = 0
 
     def observed(self, stamp: Stamp) -> float:
-        """Return the place, s, of an instant of a boot that has observations."""
+        """Return the time on the axis, s, of an instant in a boot with observations."""
         return (stamp.monotonic_ns + self.offsets_ns[stamp.boot_id]) / NS_PER_S
 
     def present(self, stamp: Stamp) -> float | None:
-        """Return the place, s, of an instant that is not before the newest observation.
+        """Return the time on the axis, s, of an instant that is not before the newest observation.
 
-        In a boot without observations the computer's clock tells it; None where that shows an earlier time than the
-        clocks did at the newest observation, so that it is wrong.
+        In a boot without observations the computer's clock is used; None if it shows an earlier time than at the newest
+        observation, and so is wrong.
         """
         if stamp.boot_id in self.offsets_ns:
             return self.observed(stamp)
@@ -61,7 +61,7 @@ class TimeAxis:
 
 
 def time_axis(source: RowSource) -> TimeAxis:
-    """Return the axis of all observations of a store, used or not: it is the same whichever sessions are looked at."""
+    """Return the axis of all observations of a store, used or not, so that it does not depend on the sessions read."""
     offsets_ns: dict[str, int] = {}
     end_ns = 0
     ends_utc_ns: tuple[int, ...] = ()
@@ -74,7 +74,7 @@ def time_axis(source: RowSource) -> TimeAxis:
         begin_ns = end_ns + passed_ns
         offsets_ns[boot["kernel_boot_id"]] = offset_ns = begin_ns - boot["first_ns"]
         end_ns = boot["last_ns"] + offset_ns
-        # The latest of before may be right where this boot's clock is behind.
+        # The latest time of earlier boots may be right if this boot's clock is behind.
         begins_utc_ns += [ns + passed_ns for ns in ends_utc_ns[-1:]]
         ends_utc_ns = tuple(sorted({ns + span_ns for ns in begins_utc_ns}))
         shown_last_ns = boot["last_utc_ns"]
@@ -85,10 +85,15 @@ def time_axis(source: RowSource) -> TimeAxis:
 
 
 def _least_ns(begins_utc_ns: Sequence[int], ends_utc_ns: Sequence[int], shown_ns: int) -> int | None:
-    """Return the least time from an end to a begin that is not before it.
+    """Return the shortest time from an end to a begin that is not before it; None if there is none.
 
-    None where every begin is before all ends. A begin that is before the UTC that the clock showed last, and nearest to
-    an end after it, is that of a clock that is behind: no end that is earlier is right then, so None as well.
+    None is also returned if the clock is behind: all begins are before the UTC that the clock last showed, and the pair
+    of begin and end that is nearest has the begin first. No earlier end is right then.
+
+    Args:
+        begins_utc_ns: possible UTC of the begin of a boot.
+        ends_utc_ns: possible UTC of the end of the previous boot.
+        shown_ns: UTC that the clock last showed.
     """
     passed_ns = [begin - end for begin in begins_utc_ns for end in ends_utc_ns]
     is_behind = all(begin < shown_ns for begin in begins_utc_ns) and min(passed_ns, key=abs, default=0) < 0

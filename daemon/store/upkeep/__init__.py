@@ -1,1 +1,1 @@
-"""Looks after a store while it is written to: packing, retention, backups, checks."""
+"""Maintenance of a store while it is written: packing, retention, backups, checks."""

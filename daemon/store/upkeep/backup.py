@@ -1,8 +1,8 @@
-"""Backups of a store and its models, made while the daemon writes; verified, rotated, and put back.
+"""Backups of a store and its models: made while the daemon writes, verified, rotated and restored.
 
 A backup is a directory, `rigcal-<UTC>`: `rigcal.sqlite`, `models/`, and `backup.json`, which is written last. A backup
-without it was never finished. A directory may hold the backups of several stores: that of another rig, or the one that
-was here before. Stores differ by the first boot that they have seen.
+without `backup.json` was never finished. A directory may contain backups of several stores, such as another rig's or
+an earlier one. Stores are distinguished by their first boot.
 """
 
 from __future__ import annotations
@@ -28,33 +28,34 @@ from daemon.version import VERSION
 
 STORE, MODELS, ABOUT = "rigcal.sqlite", "models", "backup.json"
 FORM = 1
-RESERVE_BYTES = 256 * 2**20  # stays free where a backup is written
+RESERVE_BYTES = 256 * 2**20  # free space to leave where a backup is written
 STEP_PAGES = 4096
-# More may have come after the backup was made, another session too: whose fixes those of now are, it does not say.
+# After the backup was made there may have been more fixes, and other sessions, so present fixes may not belong to the
+# session that was open in the backup.
 _CLOSE_OPEN_SESSIONS = """UPDATE calibration_sessions AS s SET state = 'closed',
         (ended_utc_ns, ended_monotonic_ns, ended_boot_id) = (SELECT * FROM (
             SELECT alive_utc_ns, alive_monotonic_ns, alive_boot_id FROM daemon_runs
             UNION ALL SELECT s.started_utc_ns, s.started_monotonic_ns, s.started_boot_id)
             ORDER BY alive_boot_id DESC, alive_monotonic_ns DESC LIMIT 1),
-        excluded = 'it was open when the backup was made that the store was restored from'
+        excluded = 'the session was open in the backup from which the store was restored'
     WHERE state = 'open'"""
 _FIRST_BOOT = "SELECT kernel_boot_id, booted_utc_ns FROM boots ORDER BY id LIMIT 1"
 _NAME = re.compile(r"rigcal-\d{8}T\d{6}Z")
 _UNFINISHED = ".unfinished"
-_ABOUT_MOST = 1 << 16  # characters of backup.json, which has some hundred
+_ABOUT_MOST = 1 << 16  # most characters read of backup.json, which has about a hundred
 
 GoOn = Callable[[], None]
 
 
 @dataclass(frozen=True)
 class Backup:
-    """A backup that was finished.
+    """A finished backup.
 
     Attributes:
         path: its directory.
         made_utc_ns: when it was begun.
-        size_bytes: of its files.
-        rigcal: version of the program that made it.
+        size_bytes: size of its files.
+        rigcal: version of the rigcal that made it.
     """
 
     path: Path
@@ -64,7 +65,7 @@ class Backup:
 
 
 def backups(directory: Path) -> list[Backup]:
-    """Return the finished backups in a directory, oldest first; none where there is no such directory."""
+    """Return the finished backups in a directory, oldest first; none if there is no such directory."""
     found = []
     for path in sorted(directory.glob("rigcal-*")) if directory.is_dir() else ():
         if _NAME.fullmatch(path.name):
@@ -74,10 +75,10 @@ def backups(directory: Path) -> list[Backup]:
 
 
 def read_backup(path: Path) -> Backup:
-    """Return what a backup says of itself.
+    """Read the description of a backup.
 
     Raises:
-        StoreError: it is none, was never finished, or is of a later form.
+        StoreError: the directory is not a backup, was never finished, or has a newer format.
     """
     try:
         with (path / ABOUT).open(encoding="utf-8") as file:
@@ -86,18 +87,20 @@ def read_backup(path: Path) -> Backup:
         backup = Backup(path, made_utc_ns, size_bytes, f"{about['rigcal']!s:.40}")
     except (OSError, ValueError, LookupError, TypeError, RecursionError) as error:
         why = f"{ABOUT}: {error!s:.200}"
-        raise StoreError(f"{path}: no backup of rigcal, or one that was never finished ({why})") from error
+        raise StoreError(f"{path}: not a backup of rigcal, or one that was never finished ({why})") from error
     if form > FORM:
-        raise StoreError(f"{path}: a backup of form {form}, made by rigcal {backup.rigcal!r}; install that version")
+        raise StoreError(
+            f"{path}: a backup of format {form}, made by rigcal {backup.rigcal!r}; install that version to use it"
+        )
     if missing := [part for part in (STORE, MODELS) if not (path / part).exists()]:
-        raise StoreError(f"{path}: no backup of rigcal any more: {' and '.join(missing)} missing")
+        raise StoreError(f"{path}: an incomplete backup: {' and '.join(missing)} missing; use another backup")
     return backup
 
 
 def _count(value: object) -> int:
-    """Return a number of `backup.json`; ValueError for what a backup does not write."""
+    """Return a number of `backup.json`; raise ValueError for a value that no backup writes."""
     if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < 2**63:
-        raise ValueError(f"{value!r:.40} is no count")
+        raise ValueError(f"{value!r:.40} is not a count")
     return value
 
 
@@ -105,28 +108,28 @@ def make_backup(store: Path, models: Path, directory: Path, keep: int, now_utc_n
     """Copy a store and its models, verify the copy, and delete the oldest backups of this store.
 
     Args:
-        store: the database; the daemon may write to it, and what it had committed is copied.
+        store: the database; the daemon may write to it, and what it has committed is copied.
         models: directory of the models.
-        directory: where backups are; made if need be.
-        keep: how many of this store stay, this one among them.
-        now_utc_ns: the instant that it is named by.
-        go_on: called again and again; what it raises ends the work and leaves no backup.
+        directory: directory of the backups; created if needed.
+        keep: how many backups of this store are kept, including this one.
+        now_utc_ns: instant after which the backup is named.
+        go_on: called repeatedly; an exception that it raises ends the work and leaves no backup.
 
     Raises:
-        StoreError: there is no room, the file system refuses, the copy is not sound, or another backup is being made
-            there; earlier backups stay.
+        StoreError: there is not enough space, the file system refuses, the copy is not sound, or another backup is
+            being made there; earlier backups are kept.
     """
     name = f"rigcal-{_named(now_utc_ns)}"
     target, scratch = directory / name, directory / f".{name}{_UNFINISHED}"
     if directory.resolve().is_relative_to(models.resolve()):
-        raise StoreError(f"{directory} is among the models, and would be in every backup: name another directory")
+        raise StoreError(f"{directory} is inside the models' directory and would be part of every backup: name another")
     with storage_errors(directory):
         directory.mkdir(parents=True, exist_ok=True)
         with _alone_in(directory):
-            for left in directory.glob(f".rigcal-*{_UNFINISHED}"):  # of one that was killed
+            for left in directory.glob(f".rigcal-*{_UNFINISHED}"):  # left by a killed process
                 shutil.rmtree(left)
             if target.exists():
-                raise StoreError(f"{target} exists: a backup was made within the last second")
+                raise StoreError(f"{target} exists already: a backup was made within the last second; try again")
             _require_room(directory, _size(store) + _size(models))
             scratch.mkdir()
             try:
@@ -153,10 +156,10 @@ def make_backup(store: Path, models: Path, directory: Path, keep: int, now_utc_n
 
 @contextlib.contextmanager
 def _alone_in(directory: Path) -> Iterator[None]:
-    """Keep a second backup out of a directory: it would take what this one has not finished for a killed one's."""
+    """Lock a directory against a second backup, which would delete this unfinished one as left by a killed process."""
     descriptor = os.open(directory, os.O_RDONLY)
     try:
-        with contextlib.suppress(OSError):  # a file system of a network may have no such locks
+        with contextlib.suppress(OSError):  # a network file system may not support such locks
             try:
                 fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
@@ -167,7 +170,7 @@ def _alone_in(directory: Path) -> Iterator[None]:
 
 
 def _forget_oldest(directory: Path, newest: Path, keep: int) -> None:
-    """Delete the oldest backups of the store that `newest` is of, so that `keep` stay, whatever the clock showed."""
+    """Delete the oldest other backups of the store of `newest`, so that `keep` remain, whatever the clock showed."""
     own = _origin(newest)
     others = [made for made in backups(directory) if made.path != newest and _origin(made.path) == own]
     for old in others[: max(0, len(others) + 1 - keep)]:
@@ -175,9 +178,9 @@ def _forget_oldest(directory: Path, newest: Path, keep: int) -> None:
 
 
 def _origin(backup: Path) -> tuple[str, int] | None:
-    """Return the first boot that a backup's store has seen, by its name and its time; None where it cannot be read.
+    """Return id and time of the first boot in a backup's store; None if the store cannot be read.
 
-    The time tells two stores apart that were made in one boot: each is computed anew, to the nanosecond.
+    The time distinguishes two stores created in the same boot, because each store computes it anew, to the nanosecond.
     """
     uri = f"{(backup / STORE).resolve().as_uri()}?mode=ro"
     with contextlib.suppress(sqlite3.Error), contextlib.closing(sqlite3.connect(uri, uri=True)) as db:
@@ -187,32 +190,32 @@ def _origin(backup: Path) -> tuple[str, int] | None:
 
 
 def restore_backup(backup: Path, store: Path, models: Path, now_utc_ns: int, go_on: GoOn) -> Path | None:
-    """Put a backup in the place of a store and its models; these are kept beside.
+    """Replace a store and its models by a backup; the replaced files are kept beside the store.
 
-    A session that was open when the backup was made is closed, and used where an operator accepts it.
+    A session that was open when the backup was made is closed, and is used only if an operator accepts it.
 
-    Ends what an earlier restore that was cut off has begun: what that one moved aside stays where it is, what it put in
-    place is written over.
+    An interrupted earlier restore is completed: files that it moved aside stay there, and files that it put in place
+    are overwritten.
 
     Args:
-        backup: its directory.
-        store: the database to be replaced, or made.
+        backup: directory of the backup.
+        store: the database to replace or create.
         models: directory of the models, likewise.
-        now_utc_ns: names the directory that what was replaced is moved to.
-        go_on: as of `make_backup`.
+        now_utc_ns: instant after which the directory of replaced files is named.
+        go_on: as for `make_backup`.
 
     Returns:
-        The directory with what was replaced; None where there was nothing.
+        The directory with the replaced files; None if there were none.
 
     Raises:
-        StoreBusyError: a daemon runs on the store.
-        StoreError: the backup is damaged, or made by a newer rigcal, the store is a link, or the file system refuses;
-            all is as it was.
+        StoreBusyError: a daemon uses the store.
+        StoreError: the backup is damaged or was made by a newer rigcal, the store is a symbolic link, or the file
+            system refuses; nothing has changed.
     """
     if store.is_symlink():
         raise StoreError(
-            f"{store} is a link to {store.resolve()}, and a restore would put a file in its place: remove the link and "
-            "restore, or let `state_directory` of the configuration name the directory that it leads to"
+            f"{store} is a link to {store.resolve()}, and a restore would replace the link by a file: remove the link "
+            "and restore, or set `state_directory` of the configuration to the directory to which it leads"
         )
     read_backup(backup)
     with storage_errors(store):
@@ -240,7 +243,7 @@ def restore_backup(backup: Path, store: Path, models: Path, now_utc_ns: int, go_
 
 
 def _make_writable(directory: Path) -> None:
-    """Let the owner change all that a directory holds: it may be the copy of a backup that nobody may change."""
+    """Make a directory and its contents writable for the owner; it may be the copy of a read-only backup."""
     for path in (directory, *directory.rglob("*")) if directory.exists() else ():
         if not path.is_symlink():
             path.chmod(path.stat().st_mode | (0o700 if path.is_dir() else 0o600))
@@ -252,10 +255,10 @@ def _close_open_sessions(store: Path) -> None:
 
 
 def _exchange(backup: Path, scratch: Path, store: Path, models: Path, name: str) -> Path | None:
-    """Move a store and its models aside and a copy of the backup into their place, with a note as long as it lasts.
+    """Move a store and its models aside and a copy of the backup into their place; a note exists during the renames.
 
     Returns:
-        The directory with what was replaced, `name` if it is free; None where there was nothing.
+        The directory with the replaced files, called `name` if this is free; None if there were none.
     """
     parts = {path.name: path for path in _files_of(store)} | {MODELS: models}
     begun = RestoreNote.of(store)
@@ -269,7 +272,7 @@ def _exchange(backup: Path, scratch: Path, store: Path, models: Path, name: str)
     left = [part for part in note.replaced if not (aside / part).exists() and parts[part].exists()]
     for part, path in parts.items():
         if part not in left:
-            _remove(path)  # of the restore that was cut off
+            _remove(path)  # put there by the interrupted restore
     moves = [(parts[part], aside / part) for part in left]
     try:
         _move_all([*moves, (scratch / STORE, store), (scratch / MODELS, models)])
@@ -295,13 +298,13 @@ def _named(utc_ns: int) -> str:
 
 
 def _new_name(directory: Path, name: str) -> Path:
-    """Return a path that nothing has yet: what was replaced within the same second is not written over."""
+    """Return an unused path, so that files replaced within the same second are not overwritten."""
     paths = (directory / f"{name}{'' if not n else f'-{n}'}" for n in itertools.count())
     return next(path for path in paths if not path.exists())
 
 
 def _give_to_owner_of(directory: Path, tree: Path) -> None:
-    """Give files that root has written to whom their directory belongs: the service could not write to them else."""
+    """Give files written by root to the owner of their directory, so that the service can write to them."""
     if os.geteuid() == 0:
         owner = directory.stat()
         for path in (tree, *tree.rglob("*")):
@@ -313,7 +316,7 @@ def _files_of(store: Path) -> list[Path]:
 
 
 def _move_all(moves: list[tuple[Path, Path]]) -> None:
-    """Rename files and directories in order; where one cannot be, the others are put back."""
+    """Rename files and directories in order; if one rename fails, undo the others."""
     done: list[tuple[Path, Path]] = []
     try:
         for source, target in moves:
@@ -333,17 +336,17 @@ def _copy_store(store: Path, copy: Path, go_on: GoOn) -> None:
         contextlib.closing(sqlite3.connect(f"{store.resolve().as_uri()}?mode=ro", uri=True)) as source,
         contextlib.closing(sqlite3.connect(copy)) as target,
     ):
-        # Within one read transaction what the daemon commits meanwhile does not make the copy begin anew.
+        # Within one read transaction, commits of the daemon do not restart the copy.
         source.isolation_level = None
         source.execute("BEGIN")
         source.execute("SELECT count(*) FROM boots").fetchone()
         source.backup(target, pages=STEP_PAGES, progress=lambda *_: go_on(), sleep=0.0)
-        # One file, that needs no other beside it to be read.
+        # A single file that can be read without companion files.
         target.execute("PRAGMA journal_mode = DELETE")
 
 
 def _copy_models(models: Path, copy: Path, go_on: GoOn) -> None:
-    """Copy all models; a directory that is being written, whose name begins with a dot, is none yet."""
+    """Copy all models; a directory whose name begins with a dot is still being written and is skipped."""
     copy.mkdir()
     for directory in sorted(models.iterdir()) if models.is_dir() else ():
         if directory.is_dir() and not directory.name.startswith("."):
@@ -353,20 +356,20 @@ def _copy_models(models: Path, copy: Path, go_on: GoOn) -> None:
 
 def _require_sound(found: Soundness, path: Path) -> None:
     if found.findings:
-        raise StoreError(f"{path}: not sound, and not used: {'; '.join(found.findings)}")
+        raise StoreError(f"{path}: damaged, so it is not used: {'; '.join(found.findings)}")
 
 
 def _require_room(directory: Path, needed_bytes: int) -> None:
     free_bytes = shutil.disk_usage(directory).free
     if free_bytes < needed_bytes + RESERVE_BYTES:
         raise StoreError(
-            f"{directory}: {free_bytes / 2**20:.0f} MiB are free, and {(needed_bytes + RESERVE_BYTES) / 2**20:.0f} MiB "
-            "are needed: free space there, or name a directory on another disk"
+            f"{directory}: {free_bytes / 2**20:.0f} MiB are free, but {(needed_bytes + RESERVE_BYTES) / 2**20:.0f} MiB "
+            "are needed: free space there, or name a directory on a different disk"
         )
 
 
 def _size(path: Path) -> int:
-    """Return the bytes of a file, or of all files in a directory; 0 where there is nothing."""
+    """Return the size of a file, or of all files in a directory, in bytes; 0 if there is none."""
     return sum(file.stat().st_size for file in _walk(path))
 
 

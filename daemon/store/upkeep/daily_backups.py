@@ -1,4 +1,4 @@
-"""Makes a backup of a store every day, in a thread of its own: a disk that does not answer holds up nothing else."""
+"""Makes a backup of a store every day, in its own thread, so that a disk that does not respond blocks nothing else."""
 
 from __future__ import annotations
 
@@ -14,30 +14,30 @@ from drivers.clock import NS_PER_S, Clock, SystemClock
 
 log = logging.getLogger(__name__)
 
-LOOK_S = 10.0  # real seconds between looks
+LOOK_S = 10.0  # real seconds between checks
 STOP_S = 5.0
 DAY_S = 86_400.0
-BACKUP_AFTER_S = 600.0  # of running: not in the midst of a start
+BACKUP_AFTER_S = 600.0  # running time before the first backup, so that it does not slow down a start
 BACKUP_RETRY_S = 3600.0
-LONGEST_S = 6 * 3600.0  # that a disk may take without a word
+LONGEST_S = 6 * 3600.0  # a backup that takes longer is reported as an error
 
 
 class _StoppedError(Exception):
-    """The daemon stops; a backup in work is given up."""
+    """The daemon is stopping; the running backup is cancelled."""
 
 
 class DailyBackups:
-    """Makes backups, the first of a run after some minutes.
+    """Makes daily backups, the first of a run after some minutes.
 
     Args:
         store: the database.
         models: directory of the models.
-        directory: where backups are.
-        keep: how many are kept.
-        clock: for the age and the names of backups.
+        directory: directory of the backups.
+        keep: how many backups are kept.
+        clock: clock for the age and the names of backups.
 
     Attributes:
-        newest_utc_ns: when the newest backup was made; None without one, and before the first step.
+        newest_utc_ns: when the newest backup was made; None without a backup, and before the first step.
     """
 
     def __init__(self, store: Path, models: Path, directory: Path, keep: int, clock: Clock) -> None:
@@ -45,34 +45,34 @@ class DailyBackups:
         self._real = SystemClock()
         self._next_ns = self._real.monotonic_ns() + round(BACKUP_AFTER_S * NS_PER_S)
         self._is_known = False
-        self._since_ns: int | None = None  # when the step in work began
+        self._since_ns: int | None = None  # when the running step began
         self._error = ""
         self._stopping = threading.Event()
         self._thread: threading.Thread | None = None
         self.newest_utc_ns: int | None = None
 
     def start(self) -> None:
-        """Begin."""
+        """Start the thread."""
         self._thread = threading.Thread(target=self._run, name="backups", daemon=True)
         self._thread.start()
 
     def stop(self) -> None:
-        """End; a backup in work is given up. Harmless when not started."""
+        """Stop the thread and cancel a running backup. Harmless when not started."""
         self._stopping.set()
         if self._thread is not None:
             self._thread.join(STOP_S)
 
     def error(self) -> str:
-        """Return why the last backup could not be made, or is not made; "" where all is well."""
+        """Return why the last backup failed, or has not ended; "" if nothing is wrong."""
         since_ns = self._since_ns
         if since_ns is not None:
             held_s = (self._real.monotonic_ns() - since_ns) / NS_PER_S
             if held_s > LONGEST_S:
-                return f"{self._directory} has been busy for {duration(held_s)}, or its disk does not answer"
+                return f"{self._directory}: the backup has run for {duration(held_s)}, or the disk does not respond"
         return self._error
 
     def step(self) -> None:
-        """Look which backups there are, and make the next if it is due, however long that takes."""
+        """Find the existing backups, and make the next one if it is due, however long that takes."""
         self._since_ns = self._real.monotonic_ns()
         try:
             if not self._is_known:
@@ -83,10 +83,10 @@ class DailyBackups:
                 self._make()
         except _StoppedError:
             pass
-        except Exception as error:  # a fault of rigcal, too: it must not end the backups of months
+        except Exception as error:  # including faults of rigcal, which must not end the daily backups
             if str(error) != self._error:
                 is_told = isinstance(error, StoreError | OSError)
-                log.error("no backup was made: %s", error, exc_info=None if is_told else error)
+                log.error("the backup failed: %s", error, exc_info=None if is_told else error)
             self._error = str(error)
         finally:
             self._since_ns = None

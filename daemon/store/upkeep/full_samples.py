@@ -1,4 +1,4 @@
-"""Readings and fixes of a stretch of time, made again from raw captures: what thinning left out is added."""
+"""Complete readings and fixes of a stretch of time: those left out by thinning are decoded again from raw captures."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ _SAMPLES = """SELECT {0}.id, channels.name, unit, monotonic_ns, value FROM {0} J
     WHERE boot_id = ? AND monotonic_ns BETWEEN ? AND ?"""
 _FIXES = "SELECT monotonic_ns FROM fixes WHERE station = ? AND boot_id = ? AND monotonic_ns BETWEEN ? AND ?"
 _SESSION = "SELECT * FROM calibration_sessions WHERE id = ?"
-# SQLite takes the other columns from the row that has the least or the greatest one.
+# With min() or max() SQLite takes the other columns from the row of the smallest or largest value.
 _OF_CHUNKS = """WITH chunks AS (SELECT first_boot_id AS boot_id, first_monotonic_ns, first_utc_ns, last_monotonic_ns,
         last_utc_ns FROM raw_chunks WHERE {}),
     firsts AS (SELECT boot_id, min(first_monotonic_ns) AS first_ns, first_utc_ns FROM chunks GROUP BY boot_id),
     lasts AS (SELECT boot_id, max(last_monotonic_ns) AS last_ns, last_utc_ns FROM chunks GROUP BY boot_id)
     SELECT boot_id, first_ns, first_utc_ns, last_ns, last_utc_ns FROM firsts JOIN lasts USING (boot_id)
     ORDER BY boot_id"""
-# By the wall clock there is no index: a rare question, for which every chunk's row is read, without its captures.
+# There is no index by the wall clock; for this rare query every chunk's row is read, without its captures.
 _STRETCHES = _OF_CHUNKS.format("last_utc_ns >= ? AND first_utc_ns <= ?")
 _BETWEEN = _OF_CHUNKS.format(
     "(last_boot_id, last_monotonic_ns) >= (?, ?) AND (first_boot_id, first_monotonic_ns) <= (?, ?)"
@@ -36,19 +36,19 @@ Stretch = tuple[Stamp, Stamp]
 def put_again(store: Store, records: Sequence[Reading | Fix], *, may_differ: bool = False) -> int:
     """Store readings and fixes of one boot that were decoded again.
 
-    A reading takes the place of the stored one of its channel and instant. A stored fix stays as it is: observations
-    name it.
+    A reading replaces the stored reading of its channel and instant. A stored fix is kept, because observations refer
+    to it.
 
     Args:
-        store: open for writing.
-        records: of a short stretch of time.
-        may_differ: a stored value may be another one.
+        store: the database, open for writing.
+        records: records of a short stretch of time.
+        may_differ: a stored value may differ from the new one.
 
     Returns:
-        How many there are now that were not there before.
+        Number of readings and fixes added.
 
     Raises:
-        StoreError: a stored value is another one and may not be: it was made with another rig file, and none of the
+        StoreError: a stored value differs although it may not, so it was made with a different rig file; none of the
             records is stored.
     """
     if not records:
@@ -87,12 +87,12 @@ def _require_the_same(store: Store, row: Mapping[str, Any], values: Sequence[flo
     if was is not None and now and not any(math.isclose(was, value, rel_tol=1e-9, abs_tol=1e-9) for value in now):
         raise StoreError(
             f"{store.path}: {row['name']} was {was:.10g} {row['unit']} and would now be {now[0]:.10g}: its readings "
-            "were made with another rig file; use that one"
+            "were made with a different rig file; use that file"
         )
 
 
 def stretches_of_session(reader: Reader, session_id: str) -> list[Stretch]:
-    """Return the stretches of captures that lie in a session, one a boot; none where there is no such session."""
+    """Return the stretches of captures in a session, one per boot; none if there is no such session."""
     for row in reader.rows(_SESSION, (session_id,)):
         since = reader.stamp(row, "started_")
         until = reader.stamp(row, "ended_") if row["ended_utc_ns"] is not None else None
@@ -103,7 +103,7 @@ def stretches_of_session(reader: Reader, session_id: str) -> list[Stretch]:
 
 
 def stretches_between(reader: Reader, first_utc_ns: int, last_utc_ns: int) -> list[Stretch]:
-    """Return the stretches of captures between two instants of the wall clock, one a boot."""
+    """Return the stretches of captures between two instants of the wall clock, one per boot."""
     return _stretches(reader, _STRETCHES, (first_utc_ns, last_utc_ns), None, None)
 
 

@@ -1,7 +1,7 @@
-"""Looks after a store while the daemon writes to it: packs captures, deletes what may go, and makes backups.
+"""Maintenance of a store while the daemon writes to it: packing of captures, deletion by age and space, and backups.
 
-All of it is done in threads of low priority, packing and deletion a bounded step at a time: acquisition comes first.
-Backups have a thread of their own, for their disk may not answer for ever.
+All of it runs in threads of low priority, and packing and deletion in bounded steps, because acquisition comes first.
+Backups have their own thread, because their disk may not respond for a long time.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ from drivers.clock import NS_PER_S, Clock, SystemClock
 
 log = logging.getLogger(__name__)
 
-LOOK_S = 10.0  # real seconds between looks
+LOOK_S = 10.0  # real seconds between checks
 PAUSE_S = 0.2  # between one step and the next
-ROOM_S = 60.0  # between two looks at the room
+ROOM_S = 60.0  # between two checks of free space
 STOP_S = 5.0
 DAY_S = 86_400.0
-LEAST_DAYS, MOST_DAYS = 1.0, 36_500.0  # that a command keeps
-# By age, no more than this many days of records go in one day: a clock that is set wrongly must not cost a year.
+LEAST_DAYS, MOST_DAYS = 1.0, 36_500.0  # limits of the days that a command keeps
+# At most this many days of records are deleted by age in one day, so that a wrong clock cannot delete a year.
 AGED_DAYS = 7.0
 
 
@@ -40,11 +40,11 @@ class Keeping:
     """Limits of what the store keeps.
 
     Attributes:
-        keep_days: older captures outside sessions go; None for no such limit.
-        free_bytes: room that the store should have.
+        keep_days: older captures outside sessions are deleted; None for no limit.
+        free_bytes: free space that the store should have.
         models: directory of the models.
-        backup_directory: of daily backups; None for none.
-        backups: how many are kept.
+        backup_directory: directory of daily backups; None for no backups.
+        backups: how many backups are kept.
     """
 
     keep_days: float | None
@@ -59,13 +59,13 @@ class KeepingState:
     """State of housekeeping.
 
     Attributes:
-        is_short: there is less room than there should be.
-        deleted_until_utc_ns: for want of room captures up to this instant were deleted outside sessions; None if none
+        is_short: there is less free space than there should be.
+        deleted_until_utc_ns: captures outside sessions up to this instant were deleted for lack of space; None if none
             were.
-        has_nothing_left: there is too little room, and nothing that may go.
+        has_nothing_left: there is too little space, and nothing more may be deleted.
         newest_backup_utc_ns: when the newest backup was made; None without one.
-        backup_error: why the last one could not be made; "" where it could.
-        has_backups: they are configured.
+        backup_error: why the last backup failed; "" if it did not.
+        has_backups: backups are configured.
     """
 
     is_short: bool = False
@@ -77,12 +77,12 @@ class KeepingState:
 
 
 class Housekeeping:
-    """Looks after a store, in threads of its own.
+    """Maintains a store, in its own threads.
 
     Args:
-        store: open for writing.
-        clock: for the age of captures, and names of backups.
-        keeping: what is kept.
+        store: the database, open for writing.
+        clock: clock for the age of captures and the names of backups.
+        keeping: limits of what is kept.
     """
 
     def __init__(self, store: Store, clock: Clock, keeping: Keeping) -> None:
@@ -91,7 +91,7 @@ class Housekeeping:
         self._real = SystemClock()
         self._told = ""
         self._told_of_room: set[str] = set()
-        self._turn = threading.Lock()  # of steps: a command may delete as well
+        self._turn = threading.Lock()  # for steps, because a command may delete as well
         self._stopping = threading.Event()
         self._thread: threading.Thread | None = None
         self._began_ns = self._real.monotonic_ns()
@@ -106,21 +106,21 @@ class Housekeeping:
 
     @property
     def state(self) -> KeepingState:
-        """State of the disk's room and of the newest backup; it may be read from any thread."""
+        """State of free space and of the newest backup; may be read from any thread."""
         made = self._backups
         if made is None:
             return self._room
         return replace(self._room, newest_backup_utc_ns=made.newest_utc_ns, backup_error=made.error())
 
     def start(self) -> None:
-        """Begin."""
+        """Start the threads."""
         if self._backups is not None:
             self._backups.start()
         self._thread = threading.Thread(target=self._run, name="housekeeping", daemon=True)
         self._thread.start()
 
     def stop(self) -> None:
-        """End after the step in work. Harmless when not started."""
+        """Stop after the running step. Harmless when not started."""
         self._stopping.set()
         if self._backups is not None:
             self._backups.stop()
@@ -134,7 +134,7 @@ class Housekeeping:
             pause_s = PAUSE_S if self.step() else LOOK_S
 
     def step(self) -> bool:
-        """Do a bounded piece of what is due.
+        """Do a bounded part of the work that is due.
 
         Returns:
             Whether there may be more.
@@ -143,12 +143,12 @@ class Housekeeping:
             with self._turn:
                 return self._make_room() or self._packing.pack_next() or self._forget_old()
         except sqlite3.Error as error:
-            log.warning("the store is not looked after for now: %s", storage_sentence(self._store.path, error))
+            log.warning("maintenance of the store failed; retrying: %s", storage_sentence(self._store.path, error))
         except (StoreError, OSError) as error:
-            log.warning("the store is not looked after for now: %s", error)
-        except Exception as error:  # a fault of rigcal must not end the packing of months
+            log.warning("maintenance of the store failed; retrying: %s", error)
+        except Exception as error:  # a fault of rigcal must not end the maintenance for months
             if str(error) != self._told:
-                log.exception("the store is not looked after for now")
+                log.exception("maintenance of the store failed; retrying")
             self._told = str(error)
         return False
 
@@ -157,16 +157,16 @@ class Housekeeping:
 
         Args:
             arguments: `days`.
-            go_on: called between steps; what it raises ends the work.
+            go_on: called between steps; an exception that it raises ends the work.
         """
         days = number_argument(arguments, "days")
         if days is None or not LEAST_DAYS <= days <= MOST_DAYS:
-            raise CommandError(f"days must be {LEAST_DAYS:g} or more, up to {MOST_DAYS:g}, not {days!r:.80}")
+            raise CommandError(f"days must be {LEAST_DAYS:g} to {MOST_DAYS:g}, not {days!r:.80}")
         newest_ns = self._prune(self._clock.now().utc_ns - round(days * DAY_S * NS_PER_S), go_on)
         return {"deleted_until_utc_ns": newest_ns}
 
     def _prune(self, older_than_ns: int, go_on: Callable[[], None]) -> int | None:
-        """Delete all that is older and may go; return the UTC in ns of the newest deleted, None where nothing was."""
+        """Delete all older captures that may be deleted; return the UTC in ns of the newest one, or None."""
         newest: int | None = None
         while True:
             go_on()
@@ -185,23 +185,23 @@ class Housekeeping:
         found = room(self._store, self._keeping.free_bytes)
         if not found.is_short:
             if self._room.is_short:
-                log.info("%s: there is room again", self._store.path)
+                log.info("%s: there is enough space again", self._store.path)
                 self._told_of_room.clear()
                 self._room = replace(self._room, is_short=False, has_nothing_left=False)
             self._next_room_s = self._running_s() + ROOM_S
             return False
         deleted = self._retention.delete_oldest()
         if deleted is None:
-            self._tell_once("little room is left, and nothing that may be deleted")
+            self._tell_once("little space is left, and nothing more may be deleted")
             self._room = replace(self._room, is_short=True, has_nothing_left=True)
             self._next_room_s = self._running_s() + ROOM_S
             return False
-        self._tell_once("little room is left; the oldest captures outside sessions are deleted")
+        self._tell_once("little space is left; the oldest captures outside sessions are deleted")
         self._room = replace(self._room, is_short=True, has_nothing_left=False, deleted_until_utc_ns=deleted)
         return True
 
     def _tell_once(self, what: str) -> None:
-        """Log what is done for want of room, once until there is room again."""
+        """Log an action for lack of space, once until there is enough space again."""
         if what not in self._told_of_room:
             self._told_of_room.add(what)
             log.warning("%s: %s", self._store.path, what)

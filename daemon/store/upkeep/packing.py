@@ -1,4 +1,4 @@
-"""Small chunks of captures, as acquisition commits them, are put together to large ones, which take far less room."""
+"""Packing of small chunks of captures, as committed by acquisition, into large ones, which need much less space."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from daemon.store.store import Store
 
 log = logging.getLogger(__name__)
 
-SPAN_NS = 60_000_000_000  # of a large chunk: what is newer lies in small ones
+SPAN_NS = 60_000_000_000  # time span of a large chunk; newer captures stay in small chunks
 MOST_CAPTURES = 100_000
-_LOOKED_AT = 10_000  # small chunks
+_LOOKED_AT = 10_000  # small chunks read at a time
 
 _SMALL = """SELECT raw_chunks.id, link_id, captures, first_boot_id AS boot, first_monotonic_ns AS first_ns,
         last_monotonic_ns AS last_ns, undecoded_chunks.chunk_id IS NOT NULL AS waits
@@ -30,26 +30,27 @@ Row = dict[str, Any]
 
 
 class Packing:
-    """Packs the chunks of a store, a large one at a time.
+    """Packs the chunks of a store, one large chunk at a time.
 
-    A large chunk is read again and compared, byte for byte and stamp for stamp, with the small ones before these go. It
-    comes and they go in one transaction: a kill or a power cut leaves the one or the others.
+    Before the small chunks are deleted, the large chunk is decoded and compared with them, byte for byte and stamp for
+    stamp. The small chunks are replaced in one transaction, so that a kill or a power cut leaves either all of them or
+    the large one.
 
     Args:
-        store: open for writing.
+        store: the database, open for writing.
     """
 
     def __init__(self, store: Store) -> None:
         self._store = store
 
     def pack_next(self) -> bool:
-        """Make one large chunk, if there are small ones for it.
+        """Make one large chunk, if there are small chunks for it.
 
         Returns:
-            whether there may be more.
+            Whether there may be more.
 
         Raises:
-            sqlite3.Error, StoreError: the store cannot be read or written; it is as it was.
+            sqlite3.Error, StoreError: the store cannot be read or written; it is unchanged.
         """
         run = self._due()
         if not run:
@@ -59,7 +60,7 @@ class Packing:
         try:
             large = packed_run([decode_run(blob) for blob in blobs]) if len(blobs) > 1 else None
         except StoreError as error:
-            log.error("%s: raw chunks %d to %d stay as they are: %s", self._store.path, ids[0], ids[-1], error)
+            log.error("%s: raw chunks %d to %d are not packed: %s", self._store.path, ids[0], ids[-1], error)
             large = None
         if large is not None and len(large.blob) >= sum(map(len, blobs)):
             large = None
@@ -82,7 +83,7 @@ class Packing:
         return bytes(row["chunk"])
 
     def _due(self) -> Sequence[Row]:
-        """Return the small chunks of one link and one boot that make the next large chunk; none where all is new."""
+        """Return the small chunks of one link and boot for the next large chunk; none if all chunks are too new."""
         newest = self._store.rows(_NEWEST)
         runs: dict[int, list[Row]] = {}  # by link
         for row in self._store.rows(_SMALL, [_LOOKED_AT]):
@@ -90,7 +91,7 @@ class Packing:
             if run and (row["boot"] != run[0]["boot"] or _is_full(run)):
                 return run
             if row["waits"]:
-                break  # as all that came later
+                break  # all later chunks wait as well
             run.append(row)
         for run in filter(None, runs.values()):
             age_ns = newest[0]["last_ns"] - run[-1]["last_ns"]
@@ -100,20 +101,20 @@ class Packing:
 
 
 def packed_run(small: Sequence[CaptureRun]) -> Chunk:
-    """Return one large chunk of the captures of small ones, which are of one link and one boot.
+    """Return one large chunk with the captures of small chunks of one link and one boot.
 
     Raises:
-        StoreError: the chunk would not give back what it was made of.
+        StoreError: the small chunks do not belong together, or the large chunk does not decode to the same captures.
     """
     run = CaptureRun(small[0].link, small[0].boot_id, small[0].is_serial, joined([own.columns for own in small]))
     if any((own.link, own.boot_id, own.is_serial) != (run.link, run.boot_id, run.is_serial) for own in small):
-        raise StoreError("they are of different links or boots than their rows say")
+        raise StoreError("their links or boots differ from those in their rows")
     chunk = encode_large(run)
     again = decode_run(chunk.blob)
     if (again.link, again.boot_id, again.is_serial) != (run.link, run.boot_id, run.is_serial) or not (
         again.columns.equals(run.columns)
     ):
-        raise StoreError("packed, they do not read as they were; this is a fault of rigcal: please report it")
+        raise StoreError("decoding the packed chunk gives different captures; this is a fault of rigcal: report it")
     return chunk
 
 

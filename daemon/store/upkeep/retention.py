@@ -1,7 +1,7 @@
-"""Deletes the oldest of what may go: captures, readings and fixes that no session needs.
+"""Deletion of the oldest captures, readings and fixes that no session needs.
 
-What lies in a session, a minute before it and a little after it, stays, and so do observations, events, gaps, jobs and
-models. Pages that become free are used again; the file does not become smaller.
+Data in a session, from a minute before it and from shortly after it are kept, and so are observations, events, gaps,
+jobs and models. Freed pages are used again; the file does not shrink.
 """
 
 from __future__ import annotations
@@ -15,21 +15,21 @@ from daemon.store.rows import RowSource
 from daemon.store.store import Store
 from drivers.clock import NS_PER_S, Clock
 
-Place = tuple[int, int]  # row of a boot, and ns of its monotonic clock: in this order everything was measured
+Place = tuple[int, int]  # row of a boot, and ns of its monotonic clock; places sort in order of time
 
 FIRST: Place = (0, -(2**63))
 LAST: Place = (2**63 - 1, 2**63 - 1)
-NEWEST_KEPT_NS = 3600 * NS_PER_S  # a session that begins now needs the last minute, and people look at the last hour
+NEWEST_KEPT_NS = 3600 * NS_PER_S  # a session that begins now needs the last minute, and people view the last hour
 TRUE_SINCE_NS = 1_735_689_600 * NS_PER_S  # 2025: a clock that shows an earlier time is not set
 STEP_CHUNKS = 20
-LOOKED_AT = 200  # chunks, of which the first ones go
+LOOKED_AT = 200  # chunks read per step, of which the first ones are deleted
 STEP_ROWS = 5000
 LOW_SHARE = 0.1
 _DAY_NS = 86_400 * NS_PER_S
 
 _WINDOWS = """SELECT started_boot_id, started_monotonic_ns, ended_boot_id, ended_monotonic_ns FROM calibration_sessions
     ORDER BY started_boot_id, started_monotonic_ns"""
-# In the order of their ends, which the index has. One that waits to be decoded stays.
+# In order of their ends, which are in the index. Chunks that wait to be decoded are kept.
 _CHUNKS = """SELECT id, first_boot_id, first_monotonic_ns, last_boot_id, last_monotonic_ns, last_utc_ns FROM raw_chunks
     WHERE (last_boot_id, last_monotonic_ns) >= (?1, ?2) AND (last_boot_id, last_monotonic_ns) < (?3, ?4)
         AND (first_boot_id, first_monotonic_ns) >= (?1, ?2) AND last_utc_ns >= ?6
@@ -40,7 +40,7 @@ _NEWEST = """SELECT last_boot_id, last_monotonic_ns FROM raw_chunks
     ORDER BY last_boot_id DESC, last_monotonic_ns DESC LIMIT 1"""
 _CLOCK = """SELECT last_utc_ns - last_monotonic_ns AS ahead_ns FROM raw_chunks WHERE last_boot_id = ?
     ORDER BY last_monotonic_ns {} LIMIT 1"""
-_CLOCKS = (_CLOCK.format("DESC"), _CLOCK.format("ASC"))  # as a boot's captures show it last, and first
+_CLOCKS = (_CLOCK.format("DESC"), _CLOCK.format("ASC"))  # by the last and by the first capture of a boot
 _LATEST = """SELECT max(utc_ns) AS utc_ns FROM (
     SELECT started_utc_ns AS utc_ns FROM calibration_sessions WHERE (started_boot_id, started_monotonic_ns) < (?1, ?2)
     UNION ALL SELECT ended_utc_ns FROM calibration_sessions WHERE (ended_boot_id, ended_monotonic_ns) < (?1, ?2)
@@ -58,12 +58,12 @@ SAMPLES = ("joint_samples", "signals", "decode_failures")
 
 @dataclass(frozen=True)
 class Room:
-    """Room for the store to grow.
+    """Free space for the store to grow.
 
     Attributes:
-        disk_bytes: free on its disk.
-        inside_bytes: in pages of its own that are free.
-        least_bytes: of both together; the oldest goes where there is less.
+        disk_bytes: free space on its disk.
+        inside_bytes: free pages in the store's file.
+        least_bytes: smallest sum of both; below it the oldest data are deleted.
     """
 
     disk_bytes: int
@@ -72,19 +72,19 @@ class Room:
 
     @property
     def is_short(self) -> bool:
-        """True if something should go."""
+        """True if data should be deleted."""
         return self.disk_bytes + self.inside_bytes < self.least_bytes
 
 
 def room(store: Store, free_bytes: int) -> Room:
-    """Return the room of a store.
+    """Return the free space of a store.
 
     Args:
-        store: on its disk.
-        free_bytes: wanted; a tenth of the disk is enough where that is less.
+        store: the store.
+        free_bytes: free space wanted; a tenth of the disk is enough if that is less.
 
     Raises:
-        OSError: the file system does not tell.
+        OSError: the file system cannot be read.
     """
     disk = shutil.disk_usage(store.path.parent)
     inside = store.pragma("freelist_count") * store.pragma("page_size")
@@ -92,27 +92,27 @@ def room(store: Store, free_bytes: int) -> Room:
 
 
 class Retention:
-    """Deletion of what may go, the oldest first, in steps that keep acquisition from the store for a moment.
+    """Deletion of data that no session needs, oldest first, in steps that block acquisition only for a moment.
 
     Args:
-        store: open for writing.
-        clock: of the computer.
+        store: the database, open for writing.
+        clock: the computer's clock.
     """
 
     def __init__(self, store: Store, clock: Clock) -> None:
         self._store, self._clock = store, clock
 
     def delete_oldest(self, older_than_ns: int | None = None) -> int | None:
-        """Delete the oldest step of what may go.
+        """Delete the oldest data that may be deleted, in one step.
 
         Args:
-            older_than_ns: UTC; only what is older. None: everything that may go.
+            older_than_ns: UTC; delete only older data. None for no limit.
 
         Returns:
-            UTC in ns of the newest capture that was deleted; None where nothing may go.
+            UTC in ns of the newest deleted capture; None if nothing may be deleted.
 
         Raises:
-            sqlite3.Error: the store cannot be read or written; each single deletion is whole.
+            sqlite3.Error: the store cannot be read or written; each single deletion is atomic.
         """
         newest = self._store.rows(_NEWEST)
         if not newest:
@@ -125,7 +125,7 @@ class Retention:
             span = [*begin, *min(end, limit)]
             found = self._timed(self._store.rows(_CHUNKS, [*span, LOOKED_AT, _ANY_NS]), begin)
             if older_than_ns is not None and all(row["last_utc_ns"] < TRUE_SINCE_NS for row in found):
-                # the next one whose clock was set tells how old they are
+                # the next chunk whose clock was set shows how old they are
                 found += self._timed(self._store.rows(_CHUNKS, [*span, 1, TRUE_SINCE_NS]), begin)
             old = (found if older_than_ns is None else self._older(found, older_than_ns))[:STEP_CHUNKS]
             if old:
@@ -137,7 +137,7 @@ class Retention:
         return None
 
     def oldest_ns(self) -> int | None:
-        """UTC in ns of the oldest capture that may go, by a clock that was set; None where there is none."""
+        """Return the UTC in ns of the oldest capture that may be deleted, by a clock that was set; None without one."""
         for begin, end in free_stretches(self._store):
             for shown_ns in (_ANY_NS, TRUE_SINCE_NS):
                 for row in self._timed(self._store.rows(_CHUNKS, [*begin, *end, 1, shown_ns]), begin):
@@ -146,24 +146,24 @@ class Retention:
         return None
 
     def aged_on(self) -> int:
-        """Day, counted from 1970, on which records last went by age; 0 where none did."""
+        """Return the day, counted from 1970, on which records were last deleted by age; 0 if none were."""
         return self._store.pragma("user_version")
 
     def note_aged(self, day: int) -> None:
-        """Note that records go by age on a day, in the number that the file's header has for its program."""
+        """Store the day on which records are deleted by age, in the `user_version` of the file's header."""
         with self._store.transaction() as db:
             db.execute(f"PRAGMA user_version = {day:d}")
 
     def _timed(self, chunks: list[dict[str, int]], begin: Place) -> list[dict[str, int]]:
-        """Return chunks with the latest UTC that tells when they were captured; a wrong one would delete young ones.
+        """Return chunks with the latest plausible UTC of their capture; too early a UTC would delete young chunks.
 
-        Their own, those by the monotonic clock from the first and the last capture of their boot, and the latest of the
-        sessions before them tell it. A UTC after both the present one and that of the newest capture of all is wrong,
-        unless it is the nearest to them: then these two may be behind.
+        Candidates are a chunk's own UTC, the UTC computed by the monotonic clock from the first and from the last
+        capture of its boot, and the latest UTC of the sessions before it. A UTC later than both the present one and
+        that of the newest capture is wrong, unless it is the candidate nearest to them: then these two may be behind.
 
         Args:
-            chunks: of one stretch between sessions.
-            begin: of the stretch.
+            chunks: chunks of one stretch between sessions.
+            begin: begin of the stretch.
         """
         if not chunks:
             return []
@@ -184,14 +184,14 @@ class Retention:
 
     @staticmethod
     def _older(chunks: list[dict[str, int]], than_ns: int) -> list[dict[str, int]]:
-        """Return the first chunks that are old, and those between them whose clock was not set."""
+        """Return the leading chunks that are old, and those between them whose clock was not set."""
         young = next((n for n, row in enumerate(chunks) if row["last_utc_ns"] >= than_ns), len(chunks))
         while young and chunks[young - 1]["last_utc_ns"] < TRUE_SINCE_NS:
-            young -= 1  # as old as what follows them, perhaps
+            young -= 1  # perhaps as young as the chunk that follows
         return chunks[:young]
 
     def _delete(self, chunk_ids: list[int], begin: Place, end: Place) -> None:
-        """Delete chunks, after all rows that were made of them: what a kill leaves, the next step deletes."""
+        """Delete chunks after all rows decoded from them, so that the next step deletes the rest after a kill."""
         for table in SAMPLES:
             self._delete_rows(_ROWS.format(table), [*begin, *end, STEP_ROWS])
         for station in [row["name"] for row in self._store.rows(_STATIONS)]:
@@ -209,7 +209,7 @@ class Retention:
 
 
 def free_stretches(source: RowSource) -> Iterator[tuple[Place, Place]]:
-    """Yield the stretches between sessions, oldest first, each from its begin up to, and without, its end."""
+    """Yield the stretches between sessions, oldest first, each as its begin and its end, the end excluded."""
     begin = FIRST
     for window in source.rows(_WINDOWS):
         boot, at_ns, end_boot, end_ns = window.values()
@@ -223,5 +223,10 @@ def free_stretches(source: RowSource) -> Iterator[tuple[Place, Place]]:
 
 
 def cutoff_ns(now_utc_ns: int, keep_days: float) -> int | None:
-    """Return the UTC before which everything may go; None where the computer's clock is not set."""
+    """Return the UTC before which data may be deleted; None if the computer's clock is not set.
+
+    Args:
+        now_utc_ns: present UTC.
+        keep_days: days to keep.
+    """
     return None if now_utc_ns < TRUE_SINCE_NS else now_utc_ns - round(keep_days * _DAY_NS)

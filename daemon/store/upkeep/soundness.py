@@ -19,7 +19,7 @@ from daemon.store.reader import Reader
 MOST_FINDINGS = 20
 MANIFEST = "manifest.json"
 
-# A retired one may have been deleted by hand; without the live one a store is half of what it was.
+# A retired model may have been deleted by hand; a store without its live model is incomplete.
 _MODELS = """SELECT id, path, manifest_sha256 FROM models WHERE state = 'live' ORDER BY id"""
 
 
@@ -28,10 +28,10 @@ class Soundness:
     """Result of the check of a store.
 
     Attributes:
-        findings: what is wrong, a clause each; empty for a sound store.
+        findings: what is wrong, one clause per finding; empty for a sound store.
         chunks: number of chunks of captures.
         captures: number of captures in them.
-        models: number of live models whose files were looked at.
+        models: number of live models whose files were checked.
     """
 
     findings: tuple[str, ...]
@@ -41,15 +41,15 @@ class Soundness:
 
 
 def check_store(path: Path, models: Path | None, go_on: Callable[[], None] = lambda: None) -> Soundness:
-    """Look for damage in a store; the daemon may write to it meanwhile.
+    """Check a store for damage; the daemon may write to it meanwhile.
 
     Args:
         path: the database.
-        models: directory that holds the models, by the names that the store knows; they are not looked at when None.
-        go_on: called again and again; what it raises ends the check.
+        models: directory of the models, under their names in the store; None to skip their check.
+        go_on: called repeatedly; an exception that it raises ends the check.
 
     Raises:
-        StoreError: it cannot be opened, or was made by a newer rigcal.
+        StoreError: the store cannot be opened, or was made by a newer rigcal.
     """
     findings: list[str] = []
     chunks = captures = looked_at = 0
@@ -60,7 +60,7 @@ def check_store(path: Path, models: Path | None, go_on: Callable[[], None] = lam
             found = [str(row["integrity_check"]) for row in reader.rows(f"PRAGMA integrity_check({MOST_FINDINGS})")]
             findings += [" ".join(line.split()) for line in found if line != "ok"]
             findings += [
-                f"a row of {row['table']} names a row of {row['parent']} that is not there"
+                f"a row of {row['table']} refers to a missing row of {row['parent']}"
                 for row in reader.rows("PRAGMA foreign_key_check")
             ][:MOST_FINDINGS]
             for row in reader.rows("SELECT id, captures, chunk FROM raw_chunks ORDER BY id"):
@@ -81,7 +81,7 @@ def check_store(path: Path, models: Path | None, go_on: Callable[[], None] = lam
 
 
 def require_known(path: Path) -> None:
-    """Raise StoreError where a newer program has made a store, or there is none."""
+    """Raise StoreError if there is no store, or a newer program has made it."""
     if not path.is_file():
         raise StoreError(f"{path}: there is no store")
     with (
@@ -97,4 +97,4 @@ def _model_findings(number: int, directory: Path, manifest_sha256: str) -> list[
         found = hashlib.sha256((directory / MANIFEST).read_bytes()).hexdigest()
     except OSError as error:
         return [f"model {number}: {directory / MANIFEST} cannot be read ({error.strerror})"]
-    return [] if found == manifest_sha256 else [f"model {number}: {directory} holds another model than the store says"]
+    return [] if found == manifest_sha256 else [f"model {number}: {directory} contains a different model"]

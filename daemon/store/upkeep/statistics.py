@@ -10,7 +10,7 @@ from typing import Any
 from daemon.store.files import database_files
 from daemon.store.reader import Reader
 
-# Each of them by an index or a small table.
+# Each figure uses an index or a small table.
 _FACTS = """SELECT (SELECT count(*) FROM raw_chunks) AS chunks, (SELECT count(*) FROM small_chunks) AS small_chunks,
     (SELECT count(*) FROM undecoded_chunks) AS undecoded_chunks,
     (SELECT count(*) FROM calibration_sessions) AS sessions, (SELECT count(*) FROM boots) AS boots"""
@@ -24,12 +24,12 @@ def statistics(path: Path, *, tables: bool = False) -> dict[str, Any]:
 
     Args:
         path: the database.
-        tables: also the bytes of each table and index, for which the whole file is read.
+        tables: also return the size of each table and index, for which the whole file is read.
 
     Returns:
-        `file_bytes` (with the write-ahead log), `free_inside_bytes` (pages that are used again), `disk_free_bytes`,
-        `chunks`, `small_chunks`, `undecoded_chunks`, `sessions`, `boots`, `oldest_utc_ns`, `newest_utc_ns`, and
-        `tables`, name -> bytes, None where this SQLite cannot tell.
+        `file_bytes` (with the write-ahead log), `free_inside_bytes` (free pages, which are used again),
+        `disk_free_bytes`, `chunks`, `small_chunks`, `undecoded_chunks`, `sessions`, `boots`, `oldest_utc_ns`,
+        `newest_utc_ns`, and `tables`, name -> bytes, None if this SQLite cannot report sizes.
 
     Raises:
         StoreError: there is no store.

@@ -120,7 +120,7 @@ def test_what_waits_to_be_decoded_for_the_first_time_is_not_stored_twice(
                     store.mark_decoded(ids)
 
         decode(1.5)
-        with pytest.raises(CommandError, match=r"waits to be decoded for the first time; ask again when"):
+        with pytest.raises(CommandError, match=r"waits to be decoded for the first time; try again when"):
             redecode_command(store, SOURCE.rig, DECODERS, everything, lambda: None)
         decode(4.0)
         result = redecode_command(store, SOURCE.rig, DECODERS, everything, lambda: None)
@@ -149,7 +149,7 @@ def test_a_time_of_the_wall_clock_is_found_and_one_without_captures_is_refused(t
     assert abs(until.monotonic_ns - 3 * NS_PER_S) < 0.1 * NS_PER_S
     for arguments, said in (
         ({"session": "s009-x"}, "no captures of session 's009-x'"),
-        ({"first_utc_ns": 1, "last_utc_ns": 2}, "no captures of the time from 1970"),
+        ({"first_utc_ns": 1, "last_utc_ns": 2}, "no captures of the period from 1970"),
         ({"first_utc_ns": 2, "last_utc_ns": 1}, "whose end is later"),
     ):
         with pytest.raises(CommandError, match=said):
@@ -162,7 +162,9 @@ def test_a_session_is_decoded_again_with_its_own_rig_file_alone(thinned: Store) 
         thinned.stamp(first), SOURCE.text, id="s001-r", prism="r", operator="", kind="check", note=""
     )
     before = table(thinned.path, "joint_samples")
-    with pytest.raises(CommandError, match=r"s001-r was recorded with another rig file.*this one -2000"):
+    with pytest.raises(
+        CommandError, match=r"s001-r was recorded with a rig file other than the one in use.*this one -2000"
+    ):
         redecode_command(thinned, OTHER.rig, OTHER_DECODERS, {"session": "s001-r"}, lambda: None)
     assert table(thinned.path, "joint_samples") == before
 
@@ -174,7 +176,10 @@ def test_a_session_from_before_a_change_of_the_dbc_file_is_not_decoded_again(thi
         thinned.stamp(first), before.text, id="s001-r", prism="r", operator="", kind="check", note=""
     )
     stored_signals = table(thinned.path, "signals")
-    with pytest.raises(CommandError, match=r"s001-r was recorded with another rig file.* channel pump is decoded as "):
+    with pytest.raises(
+        CommandError,
+        match=r"s001-r was recorded with a rig file other than the one in use.* channel pump is decoded as ",
+    ):
         redecode_command(
             thinned, after.rig, decoders(parse_config(CONFIG, tmp_path), after), {"session": "s001-r"}, lambda: None
         )
@@ -191,7 +196,7 @@ def test_a_session_that_does_not_tell_how_a_dbc_decoded_it_keeps_its_readings(th
     )
     redecode(thinned, decoders(parse_config(CONFIG, tmp_path), before), [stretch])
     stored_signals = table(thinned.path, "signals")
-    with pytest.raises(StoreError, match=r"pump was \S+ \S+ and would now be .* another rig file"):
+    with pytest.raises(StoreError, match=r"pump was \S+ \S+ and would now be .* a different rig file"):
         redecode_command(
             thinned, after.rig, decoders(parse_config(CONFIG, tmp_path), after), {"session": "s001-r"}, lambda: None
         )
@@ -215,7 +220,7 @@ def test_two_frames_of_one_instant_are_decoded_again_as_two(tmp_path: Path, sent
 def test_readings_outside_sessions_are_not_made_others_by_another_rig_file(thinned: Store) -> None:
     stretch = Stamp(UTC_0_NS, 0, "bench"), Stamp(UTC_0_NS + 4 * NS_PER_S, 4 * NS_PER_S, "bench")
     before = table(thinned.path, "joint_samples")
-    with pytest.raises(StoreError, match=r"L2 was \S+ mm and would now be \S+: .* another rig file"):
+    with pytest.raises(StoreError, match=r"L2 was \S+ mm and would now be \S+: .* a different rig file"):
         redecode(thinned, OTHER_DECODERS, [stretch])
     assert table(thinned.path, "joint_samples") == before
 

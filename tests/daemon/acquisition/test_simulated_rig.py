@@ -21,7 +21,9 @@ def test_a_simulated_rig_whose_process_has_died_says_how_to_start_it_again(tmp_p
         simulation._process.wait()
         assert simulation.has_ended()
         for _ in range(2):
-            with pytest.raises(SimulationError, match=r"^the simulated rig has ended; .*`rigcal run --sim` starts"):
+            with pytest.raises(
+                SimulationError, match=r"^the simulated rig has ended; .* start both again with `rigcal run --sim`"
+            ):
                 simulation.aim("r")
     finally:
         simulation.close()

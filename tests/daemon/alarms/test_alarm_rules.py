@@ -464,7 +464,7 @@ def test_links_that_a_simulated_rig_has_left_behind_are_explained_by_its_end() -
     ended = known(links=[link(False), link(False, name="station")], has_simulation_ended=True)
     (alarm,) = (alarm for rule in library() for alarm in rule(ended) if alarm.severity == "critical")
     assert alarm.kind == "simulated_rig_ended"
-    assert "`rigcal run --sim` starts it again" in alarm.remedy
+    assert "start it again with a new simulated rig: `rigcal run --sim`" in alarm.remedy
 
 
 def test_every_kind_is_in_the_documentation_with_what_to_do() -> None:

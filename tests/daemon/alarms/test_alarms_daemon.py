@@ -67,7 +67,7 @@ def test_links_that_cannot_be_opened_are_alarms_that_outlive_a_restart(
         shown = rigcal("status", "--socket", str(socket)).stdout.splitlines()
         assert shown[2].startswith("alarms    CRITICAL link_down boom: ")
         listed = rigcal("alarms", "--socket", str(socket)).stdout
-        assert "rigcal opens the link again by itself" in listed
+        assert "rigcal reopens the link by itself" in listed
     raised = [r for r in caplog.records if r.name == "daemon.alarms.board"]
     assert sorted(r.levelno for r in raised) == [logging.WARNING, logging.ERROR]
     caplog.clear()
@@ -85,7 +85,7 @@ def test_a_clock_that_was_set_back_while_rigcal_did_not_run_is_an_event_and_alar
     clock.ahead_s = -7200.0
     with running(tmp_path, clock) as socket:
         wait_until(lambda: {("clock_stepped", "clock"), ("clock_behind", "clock")} <= set(active(socket)))
-        assert "by 7200.0 s while rigcal did not run" in active(socket)["clock_stepped", "clock"]["text"]
+        assert "by 7200.0 s while rigcal was not running" in active(socket)["clock_stepped", "clock"]["text"]
         clock.ahead_s = 0.0
         wait_until(lambda: ("clock_behind", "clock") not in active(socket))
     steps = [e["code"] for e in table(tmp_path / "rigcal.sqlite", "device_events") if e["kind"] == "clock_step"]

@@ -36,7 +36,7 @@ def test_a_bus_that_is_not_there_is_critical_with_a_line_and_a_remedy(tmp_path: 
     first, second, third = told.stdout.splitlines()
     assert first == "CRITICAL: 2 findings"
     assert second.startswith("critical: boom: ")
-    assert second.endswith("Check the plug, the adapter and its power; rigcal opens the link again by itself.")
+    assert second.endswith("Check the plug, the adapter and its power. rigcal reopens the link by itself.")
     assert third.startswith("warning: station: ")
     assert (as_json["status"], as_json["exit_status"]) == ("CRITICAL", 2)
     assert [finding["kind"] for finding in as_json["findings"]] == ["link_down", "link_down"]

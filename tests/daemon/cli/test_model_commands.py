@@ -198,7 +198,7 @@ def test_a_daemon_that_is_not_told_to_sends_no_tip_and_its_link_would_refuse_one
 
 def test_a_tip_on_a_link_that_may_not_send_is_refused(tmp_path: Path) -> None:
     assert "tip.can needs allow_transmit = true on link 'boom'" in check(GOOD + TIP, tmp_path)
-    assert "no [[can]] link is called so" in check(MAY_SEND + TIP.replace('"boom"', '"arm"'), tmp_path)
+    assert "no [[can]] link has this name" in check(MAY_SEND + TIP.replace('"boom"', '"arm"'), tmp_path)
 
 
 @pytest.mark.parametrize("identifier", ["0x181", "0x67F", "0x6DF", "0x7E4", "0x800", "-1"])

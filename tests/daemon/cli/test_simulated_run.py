@@ -69,7 +69,8 @@ def test_a_simulated_rig_that_has_died_is_told_instead_of_a_plug(tmp_path: Path)
         assert "next      simulation: Stop the daemon; `rigcal run --sim` starts it again" in status
         refused = run_apart("session", "start", "--prism", "r", *where)
         assert (
-            "the simulated rig has ended; stop the daemon, and `rigcal run --sim` starts both again" in refused.stderr
+            "the simulated rig has ended; stop the daemon, and start both again with `rigcal run --sim`"
+            in refused.stderr
         )
 
 

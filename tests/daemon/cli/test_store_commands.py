@@ -86,7 +86,7 @@ def test_while_a_daemon_runs_it_is_asked_and_only_a_restore_is_refused(config: P
         (["prune"], "give --days"),
         (["redecode"], "give either --session"),
         (["redecode", "--from", "2026-01-01"], "give either --session"),
-        (["restore", "/nowhere"], "no backup of rigcal"),
+        (["restore", "/nowhere"], "not a backup of rigcal"),
     ],
 )
 def test_wrong_use_is_one_sentence_that_says_what_to_do(config: Path, words: list[str], said: str) -> None:

@@ -220,7 +220,7 @@ def test_nodes_outside_canopen_are_refused(tmp_path: Path) -> None:
     message = check(
         GOOD.replace('channel = "can0"', 'channel = "can0"\nallow_transmit = true\ntransmit_nodes = [128]'), tmp_path
     )
-    assert "CANopen nodes are 1 to 127" in message
+    assert "CANopen nodes have numbers from 1 to 127" in message
 
 
 def test_two_links_of_one_name_are_refused(tmp_path: Path) -> None:
@@ -256,7 +256,7 @@ def test_a_second_station_is_refused() -> None:
     text = 'rig = "swdt82"\n' + "".join(
         f'[[station]]\nname = "{name}"\nserial.path = "/dev/{name}"\n' for name in ("one", "two")
     )
-    with pytest.raises(ConfigError, match=r"sessions know one station: keep one \[\[station\]\]"):
+    with pytest.raises(ConfigError, match=r"sessions use one station: keep one \[\[station\]\]"):
         parse_config(text, Path("rigcal.toml"))
 
 
@@ -264,7 +264,7 @@ def test_a_port_belongs_to_one_link() -> None:
     text = 'rig = "swdt82"\n' + "".join(
         f'[[can]]\nname = "{name}"\ninterface = "socketcan"\nchannel = "can0"\n' for name in ("boom", "base")
     )
-    with pytest.raises(ConfigError, match=r"two links are at 'can0'"):
+    with pytest.raises(ConfigError, match=r"two links use 'can0'"):
         parse_config(text, Path("rigcal.toml"))
 
 
@@ -278,7 +278,7 @@ channel = "{tmp_path}/{can}"
 [[station]]
 serial.path = "{tmp_path}/{station}"
 '''
-    with pytest.raises(ConfigError, match=r"two links are at '.*ttyUSB0'"):
+    with pytest.raises(ConfigError, match=r"two links use '.*ttyUSB0'"):
         parse_config(text, Path("rigcal.toml"))
 
 

@@ -80,7 +80,7 @@ def test_a_new_setup_within_a_guide_is_held_to_the_same_names(daemon: Config) ->
 def test_a_request_has_no_other_members(daemon: Config) -> None:
     answer = talk(daemon.socket_path, b'{"command": "session.start", "args": {"prism": "r", "setup": "S1"}}\n')
     assert (answer["ok"], answer["status"]) == (False, 2)
-    assert answer["error"].startswith("a request has no args; it is {")
+    assert answer["error"].startswith("unknown key args in the request; a request is {")
 
 
 def test_a_name_that_cannot_be_printed_is_told_safely(daemon: Config) -> None:

@@ -136,7 +136,7 @@ def test_the_socket_of_a_killed_daemon_is_replaced(tmp_path: Path) -> None:
 def test_a_file_that_is_no_socket_is_left_alone(tmp_path: Path) -> None:
     precious = tmp_path / "precious.txt"
     precious.write_text("keep me", encoding="utf-8")
-    with pytest.raises(CommandError, match="cannot be made: Address already in use"):
+    with pytest.raises(CommandError, match="cannot be created: Address already in use"):
         ControlServer(precious, {})
     assert precious.read_text(encoding="utf-8") == "keep me"
 

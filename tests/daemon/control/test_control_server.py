@@ -119,7 +119,7 @@ def test_more_clients_than_there_are_places_for_are_told_so(tmp_path: Path) -> N
         contextlib.ExitStack() as stack,
     ):
         busy = [stack.enter_context(connected(tmp_path / "s", b'{"command": "wait"}\n')) for _ in range(2)]
-        with pytest.raises(CommandError, match="serves 2 clients already; try again") as refused:
+        with pytest.raises(CommandError, match="already serves 2 clients; try again") as refused:
             request(tmp_path / "s", "echo")
         assert refused.value.status == 1
         release.set()

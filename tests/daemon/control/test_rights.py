@@ -107,7 +107,7 @@ def test_every_command_that_changes_something_is_logged_with_its_user(
         request(config.socket_path, "status")
         request(config.socket_path, "setup.new", {"id": "S1"})
     said = [r.getMessage() for r in caplog.records if r.name == "daemon.control.server"]
-    assert said == [f"setup.new, asked for by {Caller(OWN_USER, os.geteuid(), os.getpid())}"]
+    assert said == [f"setup.new, requested by {Caller(OWN_USER, os.geteuid(), os.getpid())}"]
 
 
 @pytest.mark.parametrize("forged", ["caller_user", "caller_uid", "caller", "uid"])
@@ -131,7 +131,7 @@ def test_every_command_either_reads_or_changes() -> None:
         commands = set(str(unknown.value).partition("known: ")[2].split(", "))
         assert commands > READING
         for command in sorted(commands - READING):
-            with pytest.raises(CommandError, match=f"{command} does: {HOW}") as refused:
+            with pytest.raises(CommandError, match=f"{command} does; {HOW}") as refused:
                 request(reading_socket(config.socket_path), command)
             assert refused.value.status == 3
         for command in ("status", "setup.list", "session.list", "jobs.list", "model.list"):

@@ -248,7 +248,7 @@ def test_a_shot_of_something_else_is_refused_and_a_station_that_moved_ends_the_g
     daemon.say("guide.done")
     daemon.wait("a word about the shot", lambda: "nothing was stored" in str(state(daemon)["messages"]))
     refused = state(daemon)
-    assert "from control point cp1, and nothing was stored: aim it at cp1" in str(refused["messages"])
+    assert "from control point cp1, and nothing was stored: aim at cp1" in str(refused["messages"])
     assert (refused["step"]["kind"], refused["step"]["button"] is not None) == ("shoot_control_point", True)
     daemon.say("guide.stop", reason="the test goes on")
     setups = {setup["id"]: setup for setup in daemon.say("setup.list")}

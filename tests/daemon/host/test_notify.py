@@ -58,7 +58,7 @@ def test_a_service_manager_that_is_gone_ends_no_daemon(tmp_path: Path, caplog: p
     notifier = Notifier({"NOTIFY_SOCKET": str(tmp_path / "notify")})
     for _ in range(3):
         notifier.send("WATCHDOG=1")
-    assert caplog.text.count("the service manager is not reached") == 1
+    assert caplog.text.count("the service manager cannot be reached") == 1
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
         manager.bind(str(tmp_path / "notify"))
         notifier.send("WATCHDOG=1")

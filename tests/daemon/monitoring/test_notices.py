@@ -366,8 +366,8 @@ def test_a_way_that_leads_nowhere_is_refused(tmp_path: Path) -> None:
         ('webhook_url = "file:///etc/passwd"', "notify.webhook_url: give the address of a web server"),
         ('webhook_url = "http://chat..example.com/"', "notify.webhook_url: give the address of a web server"),
         (f'webhook_url = "http://{"a" * 64}.example.com/"', "notify.webhook_url: give the address of a web server"),
-        ('command = ["/bin/true", "a\\u0000"]', "notify.command.2: holds a zero byte"),
-        ('command = ["mail"]', "notify.command: the program needs its whole path"),
+        ('command = ["/bin/true", "a\\u0000"]', "notify.command.2: contains a zero byte"),
+        ('command = ["mail"]', "notify.command: give the program's full path"),
         ("", "notify: give webhook_url, command, or both"),
         ('webhook = "x"', "notify.webhook: unknown key; allowed here: command, least, webhook_url"),
     ):

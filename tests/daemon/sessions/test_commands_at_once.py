@@ -90,7 +90,7 @@ def test_a_shot_is_answered_where_it_cannot_be_stored_that_the_station_was_turne
     answer = shoot_without_storing_fixes(session_rig)
     assert isinstance(answer, dict)
     assert answer["point"] == "cp1"
-    assert "cannot be stored that the station was turned to prism r" in caplog.text
+    assert "the turn of the station to prism r could not be stored" in caplog.text
     assert len(table(session_rig.store.path, "control_shots")) == 1
     make_room(session_rig.store)
     session_rig.target_mm = prism_mm
@@ -114,7 +114,7 @@ def test_an_observation_that_can_never_be_stored_takes_none_of_those_that_wait_w
     measured = [row["monotonic_ns"] for row in table(session_rig.store.path, "fixes")]
     assert observed == measured[: len(observed)]
     assert len(observed) > 45
-    assert caplog.text.count("cannot be stored, and is left out") == 1
+    assert caplog.text.count("can never be stored, and was discarded") == 1
 
 
 def tell_a_fix_of_the_far_future(rig: Rig) -> None:

@@ -49,7 +49,7 @@ def test_a_set_up_that_is_used_again_is_watched_though_a_newer_one_is_there(rig:
     rig.say("stop")
     assert alarms(rig) == [("S1", "warning")], "nor does the station stand at S2 now"
     assert rig.setups.current() is None
-    with pytest.raises(CommandError, match="set-up 'S1', where the station stood last, has moved"):
+    with pytest.raises(CommandError, match="the current set-up 'S1' has moved"):
         rig.say("start", prism="r")
     described(rig, "S3")
     assert (rig.setups.current(), alarms(rig)) == ("S3", [])

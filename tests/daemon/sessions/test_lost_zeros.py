@@ -70,7 +70,7 @@ def test_a_session_in_which_an_encoder_jumps_is_not_calibrated_with_the_one_that
     session_rig.shoot("cp1", (9000.0, 500.0, 2000.0))
     ended = session_rig.say("stop")
     assert ended["not_used"] == LOST
-    assert any("start anew" in sentence for sentence in ended["advice"])
+    assert any("start a new session" in sentence for sentence in ended["advice"])
     second = controlled(session_rig)
     assert used(session_rig) == [second] != [first]
     session_rig.keeper = session_rig.new_keeper()  # as a daemon that was started again

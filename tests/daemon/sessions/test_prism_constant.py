@@ -30,7 +30,7 @@ class ConstantRig(Rig):
 
 rig = closed_afterwards(ConstantRig)
 CP1 = (9000.0, 500.0, 2000.0)
-OTHER = "the station applies a prism constant of 0 mm, and -30 mm at first"
+OTHER = "the station applies a prism constant of 0 mm, but applied -30 mm at first"
 
 
 def test_fixes_with_another_prism_constant_than_the_session_began_with_are_not_used(rig: ConstantRig) -> None:
@@ -93,7 +93,7 @@ def ended(rig: ConstantRig, constant_mm: float) -> dict[str, Any]:
 
 
 def test_a_session_whose_constant_is_not_the_one_of_its_set_up_is_not_used(rig: ConstantRig) -> None:
-    assert ended(rig, 0.0)["not_used"] == "station applied a prism constant of 0 mm to r, and set-up S1 says -30 mm"
+    assert ended(rig, 0.0)["not_used"] == "station applied a prism constant of 0 mm to r, but set-up S1 gives -30 mm"
     assert ended(rig, -30.0)["not_used"] is None
 
 
@@ -101,7 +101,7 @@ def test_sessions_with_different_constants_are_not_used_together(rig: ConstantRi
     rig.clock.advance(1.0)
     rig.say("setup_new", id="S2")
     assert ended(rig, -30.0)["not_used"] is None
-    assert ended(rig, 0.0)["not_used"] == "station applied a prism constant of 0 mm to r, and session s001-r has -30 mm"
+    assert ended(rig, 0.0)["not_used"] == "station applied a prism constant of 0 mm to r, but session s001-r has -30 mm"
     assert ended(rig, -30.0)["not_used"] is None
     rig.clock.advance(1.0)
     rig.say("setup_new", id="S3")

@@ -108,7 +108,7 @@ def test_a_prism_that_an_operator_confirms_counts_from_then_on(rig: Rig) -> None
     rig.live(5)
     before = len(used(rig))
     answer = rig.say("confirm_prism", operator="Ada")
-    assert answer["text"] == "Ada confirms that the station is on prism r; its fixes count from now on"
+    assert answer["text"] == "Ada confirms that the station is on prism r; its fixes are used from now on"
     assert [s["distance_m"] for s in answer["ended"]] == [pytest.approx(10.0)]
     (advice,) = answer["advice"]
     assert "if it was on another prism then, abort the session" in advice

@@ -271,7 +271,7 @@ def test_a_log_that_is_not_the_session_s_is_refused_as_its_marks_would_be_mispla
     arguments = ["replay", log, "--session", told, "--config", marked / "rigcal.toml", "--store", store]
     result = CliRunner().invoke(main, [*map(str, arguments)])
     assert result.exit_code == 2
-    assert "give the log that was exported with it" in result.output.replace("\n", " ")
+    assert "give the log exported with that file" in result.output.replace("\n", " ")
     assert not store.exists()
 
 
@@ -300,7 +300,7 @@ def test_a_replay_knows_the_control_points(tmp_path: Path, recorded: Sequence[Ca
     ("text", "reason"),
     [
         (None, "cannot be read"),
-        ("[]", "is no exported session"),
+        ("[]", "is not the file of an exported session"),
         ('{"prism": "r", "kind": "check", "since_utc_ns": 0, "until_utc_ns": 1}', "control_points: Field required"),
     ],
 )

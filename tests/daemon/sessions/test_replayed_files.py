@@ -64,8 +64,8 @@ def test_a_log_of_two_buses_is_refused_where_one_is_configured(
     path = log(tmp_path / f"mixed{suffix}", *channels)
     known = "can0, boom" if suffix == ".log" else "can0"
     assert (
-        f"{path}: holds frames of several channels, can0, can1, of which more than one would become link 'boom': "
-        f"configure each as a [[can]] (known: {known}), or give a log of the link's channel alone"
+        f"{path}: contains frames of several channels, can0, can1, and more than one would become link 'boom': "
+        f"configure each as a [[can]] (known: {known}), or give a log of only the link's channel"
     ) in refusal(config, path)
 
 
@@ -96,14 +96,14 @@ def test_a_log_of_one_bus_is_the_one_link_s_whatever_its_channel_is_called(
 
 def test_a_log_that_is_given_twice_is_refused(tmp_path: Path, config: Path) -> None:
     path = log(tmp_path / "boom.log", "boom")
-    assert f"{path}: is given twice: its captures would be stored twice" in refusal(config, path, path)
+    assert f"{path}: is given twice, so its captures would be stored twice" in refusal(config, path, path)
 
 
 @pytest.mark.parametrize("suffix", FORMATS)
 def test_a_copy_of_a_log_is_refused_beside_it_in_whatever_format(tmp_path: Path, config: Path, suffix: str) -> None:
     first, copy = log(tmp_path / "first.log", "boom"), log(tmp_path / f"copy{suffix}", "can0")
     text = refusal(config, first, copy)
-    assert f"{copy}: holds captures of link 'boom' from 2023-11-14 22:13:20 UTC to" in text
+    assert f"{copy}: contains captures of link 'boom' from 2023-11-14 22:13:20 UTC to" in text
     assert f"and so does {first}: they would be stored twice; give one of the two" in text
 
 
@@ -147,5 +147,5 @@ def test_a_log_that_is_played_back_is_one_bus_s(tmp_path: Path, config: Path) ->
     played.run(take, stop)
     assert {item.link for item in items} == {"boom"}
     log(path, "boom", "feed")
-    with pytest.raises(DescriptionError, match="several channels, boom, feed, of which more than one would become"):
+    with pytest.raises(DescriptionError, match="several channels, boom, feed, and more than one would become"):
         live(settings, load_rig(settings.rig))

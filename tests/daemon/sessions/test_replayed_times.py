@@ -69,9 +69,9 @@ def test_an_asc_of_another_time_zone_is_refused_with_both_times_and_what_to_do(t
     assert result.exit_code == 2
     said = " ".join(result.output.split())
     assert re.search(
-        r"boom.asc: holds captures of link 'boom' from 2023-11-14 23:13:20 UTC to 2023-11-14 23:13:\d\d UTC, and "
-        r"the session was from 2023-11-14 22:13:21 UTC to 2023-11-14 22:13:\d\d UTC: an .asc holds local time without "
-        r"its zone: set the environment variable TZ .* or export the session with --format candump",
+        r"boom.asc: contains captures of link 'boom' from 2023-11-14 23:13:20 UTC to 2023-11-14 23:13:\d\d UTC, but "
+        r"the session lasted from 2023-11-14 22:13:21 UTC to 2023-11-14 22:13:\d\d UTC: an .asc contains local time "
+        r"without a time zone: set the environment variable TZ .* or export the session with --format candump",
         said,
     )
     assert not (tmp_path / "new.sqlite").exists()
@@ -101,7 +101,7 @@ def test_an_asc_of_the_second_hour_of_two_is_refused_with_a_zone_in_which_it_is_
     result = replayed(tmp_path, path, **changes)
     assert result.exit_code == 2
     said = " ".join(result.output.split())
-    assert f"set the environment variable TZ to {fixed}, in which" in said
+    assert f"set the environment variable TZ to {fixed}, with which" in said
     assert said.endswith("or export the session with --format candump")
     local(fixed)
     assert replayed(tmp_path, path, **changes).exit_code == 0
@@ -112,8 +112,8 @@ def test_logs_of_another_session_are_refused(tmp_path: Path) -> None:
     result = replayed(tmp_path, STANDING / "boom.log", since_ns=FIRST_NS + day_ns, until_ns=LAST_NS + day_ns)
     assert result.exit_code == 2
     said = " ".join(result.output.split())
-    assert "and the session was from 2023-11-15 22:13:20 UTC" in said
-    assert said.endswith("give the files that were exported with it")
+    assert "but the session lasted from 2023-11-15 22:13:20 UTC" in said
+    assert said.endswith("give the files that were exported with the session")
 
 
 def test_a_replay_tells_how_many_observations_can_be_used_and_why_others_cannot(tmp_path: Path) -> None:

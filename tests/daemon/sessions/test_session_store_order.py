@@ -80,7 +80,7 @@ def test_a_full_disk_is_told_in_a_sentence_that_says_what_to_do(
     assert caught.value.status == 1
     sentence = str(caught.value)
     assert f"{session_rig.store.path}: cannot be written, the disk is full (database or disk is full;" in sentence
-    assert sentence.endswith("nothing was changed, so give the command again")
+    assert sentence.endswith("nothing was changed, so repeat the command afterwards")
     assert "Traceback" not in caplog.text
 
 

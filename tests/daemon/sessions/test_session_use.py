@@ -69,7 +69,7 @@ def test_a_station_that_moved_is_not_taken_for_where_it_stood_before(session_rig
         session_rig.say("start", prism="r")
     assert caught.value.status == 3
     assert str(caught.value) == (
-        "set-up 'S2', where the station stood last, has moved; describe a new one (`rigcal setup new`), or name one "
+        "the current set-up 'S2' has moved; describe a new one with `rigcal setup new`, or name an earlier one "
         "with --setup if the station stands there again"
     )
     assert session_rig.setups.current() is None, "nor does the live tip"
@@ -82,7 +82,7 @@ def test_a_shot_that_finds_a_move_says_what_to_do(session_rig: Rig) -> None:
     session_rig.live(2)
     assert session_rig.shoot("cp1", CP1)["advice"] == []
     stop, accept = session_rig.shoot("cp1", ELSEWHERE)["advice"]
-    assert "stop the session, describe where the station stands now with `rigcal setup new`" in stop
+    assert "stop the session, describe the station's new set-up with `rigcal setup new`" in stop
     assert "`rigcal session accept s001-r`" in accept
 
 
@@ -99,7 +99,7 @@ def test_a_session_without_control_shots_is_stored_and_shown_and_nothing_trains_
     name = uncontrolled(session_rig)
     shown = session_rig.say("show", id=name)
     assert shown["observations"] > 10
-    assert shown["not_used"].startswith("no control point was shot at its start and again at its end")
+    assert shown["not_used"].startswith("no control point was shot at both start and end")
     assert Jobs(session_rig).due() == []
     other = controlled(session_rig)
     orders = Jobs(session_rig).run()
@@ -110,9 +110,9 @@ def test_a_session_without_control_shots_is_stored_and_shown_and_nothing_trains_
 @pytest.mark.parametrize(
     ("start", "end", "why"),
     [
-        (CP1, None, "no control point was shot at its start and again at its end"),
-        (None, CP1, "no control point was shot at its start and again at its end"),
-        (CP1, ELSEWHERE, "control point cp1 was 20.0 mm off at its end, so the station had moved"),
+        (CP1, None, "no control point was shot at both start and end"),
+        (None, CP1, "no control point was shot at both start and end"),
+        (CP1, ELSEWHERE, "control point cp1 was 20.0 mm off at the session's end, so the station had moved"),
     ],
 )
 def test_a_session_whose_ends_were_not_controlled_is_not_used(
@@ -137,7 +137,7 @@ def test_two_shots_at_the_end_do_not_make_up_for_the_one_at_the_start(session_ri
     session_rig.live(2)
     assert session_rig.shoot("cp1", CP1)["phase"] == "end"
     assert session_rig.say("stop")["not_used"].startswith(
-        "most of its poses do not lie between a control point's shots"
+        "most poses do not lie between a control point's shot at the session's start"
     )
 
 
@@ -164,13 +164,13 @@ def test_a_point_that_is_shot_later_does_not_vouch_for_the_poses_before_it(sessi
     session_rig.shoot("cp2", ELSEWHERE)
     name = session_rig.say("stop")["id"]
     assert session_rig.say("show", id=name)["not_used"].startswith(
-        "the control point that was shot at its start was not"
+        "the control point shot at the session's start was not"
     )
 
 
 def test_no_set_up_is_described_while_a_session_goes_on_in_another(session_rig: Rig) -> None:
     name = session_rig.say("start", prism="r")["id"]
-    with pytest.raises(CommandError, match=f"session '{name}' is open where the station stood at its start") as caught:
+    with pytest.raises(CommandError, match=f"session '{name}' is open in the present set-up") as caught:
         session_rig.say("setup_new", id="S2")
     assert caught.value.status == 3
     session_rig.say("abort")
@@ -191,7 +191,7 @@ def test_a_moving_session_is_controlled_like_any_other(session_rig: Rig) -> None
 def test_an_aborted_session_is_never_used(session_rig: Rig) -> None:
     session_rig.say("start", prism="r")
     session_rig.say("abort")
-    with pytest.raises(CommandError, match="session 's001-r' is aborted, and stays so"):
+    with pytest.raises(CommandError, match="session 's001-r' was aborted, and cannot be accepted"):
         session_rig.say("accept", id="s001-r")
     assert Jobs(session_rig).due() == []
 
@@ -250,7 +250,7 @@ def test_a_check_session_without_control_shots_judges_nothing_until_it_is_accept
     ("name", "why"),
     [
         ("nothing", "there is no session 'nothing'"),
-        ("s001-r", "session 's001-r' is used by calibration; there is nothing to accept"),
+        ("s001-r", "session 's001-r' is already used by calibration; there is nothing to accept"),
         ("s002-r", "session 's002-r' is open; stop it first"),
     ],
 )

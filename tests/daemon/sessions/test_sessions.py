@@ -318,7 +318,7 @@ def test_a_setup_that_moved_is_flagged_and_refused_from_then_on(rig: Rig) -> Non
     with pytest.raises(CommandError, match="set-up 'S1' has moved") as caught:
         rig.say("start", prism="r", setup="S1")
     assert caught.value.status == 3
-    with pytest.raises(CommandError, match="set-up 'S1', where the station stood last, has moved; describe a new one"):
+    with pytest.raises(CommandError, match="the current set-up 'S1' has moved; describe a new one"):
         rig.say("start", prism="r")
 
 
@@ -373,7 +373,7 @@ def test_a_shot_that_ends_between_the_making_of_an_observation_and_its_storing_e
 def test_a_control_point_that_is_not_there_is_told(rig: Rig) -> None:
     start(rig)
     rig.keeper._settings = SessionsSection(fixes_per_shot=10_000, shot_timeout_s=1.0)
-    with pytest.raises(CommandError, match="of 10000 good fixes within 1 s; is the station aimed"):
+    with pytest.raises(CommandError, match="of 10000 good fixes within 1 s; check with"):
         rig.shoot("cp1", (9000.0, 500.0, 2000.0))
     with pytest.raises(CommandError, match="'r' is a prism of the rig"):
         rig.say("shoot", point="r")
@@ -417,7 +417,7 @@ def test_the_operator_is_told_what_is_still_to_be_done(rig: Rig) -> None:
     rig.live(2)
     advice = rig.say("stop")["advice"]
     assert "control points not shot at the session's end" in advice[0]
-    assert "a check wants 3 to 5 poses; this one has 1" in advice[1]
+    assert "a check session should have 3 to 5 poses; this one has 1" in advice[1]
 
 
 def test_setups_are_described_once_and_checked(rig: Rig) -> None:

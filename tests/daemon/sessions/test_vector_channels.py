@@ -102,7 +102,7 @@ def test_a_log_of_channel_1_that_may_be_any_link_s_is_refused(tmp_path: Path, su
     path = tmp_path / f"recorded{suffix}"
     write_can_log(path, frames("boom"))
     config = configured(tmp_path, **{"arm": "can0", "left-arm": "can1"})
-    with pytest.raises(DescriptionError, match=r"channel 1 alone.*in that of no link: name the file \.\.\.-LINK"):
+    with pytest.raises(DescriptionError, match=r"channel 1 only.*does not end with a link: name the file \.\.\.-LINK"):
         links_of(path, config, TOLD)
 
 
@@ -130,7 +130,8 @@ def test_frames_do_not_come_under_a_link_that_has_the_number_of_another_by_now(
         write_can_log(path, frames(link), then)
     config = configured(tmp_path, **{link: ports[link] for link in now})
     assert links_of(logs["boom"], config) == {"boom"}, "which has channel 1, and goes by its name"
-    said = "has frames of link 'boom' by the channel number.*of 'arm' by the file's name: .* with --session"
+    said = "has frames of link 'boom' according to the channel number.*of 'arm' according to the file's name: "
+    said += ".* with --session"
     with pytest.raises(DescriptionError, match=said):
         links_of(logs["arm"], config)
     told = TOLD.model_copy(update={"can_channels": then})
@@ -150,9 +151,9 @@ def test_the_exported_log_of_a_link_without_captures_is_taken_with_its_session_f
     other = tmp_path / f"other.{can_format}"
     other.write_bytes(silent.read_bytes())
     for files, known, said in (
-        ([silent], told, "no file holds captures"),
-        ([silent, rest["boom"]], None, "holds no captures: leave it out"),
-        ([other, rest["boom"]], told, "holds no captures: leave it out"),
+        ([silent], told, "no file contains captures"),
+        ([silent, rest["boom"]], None, "contains no captures: leave it out"),
+        ([other, rest["boom"]], told, "contains no captures: leave it out"),
     ):
         with pytest.raises(DescriptionError, match=said):
             first_captures(files, config, known)
@@ -164,7 +165,7 @@ def test_a_log_that_has_lost_its_captures_is_no_silent_link_s(tmp_path: Path) ->
     told = TOLD.model_copy(update={"can_channels": {"boom": 1, "arm": 2}, "doubtful": doubtful})
     path = tmp_path / "s001-r-arm.log"
     write_can_log(path, [])
-    with pytest.raises(DescriptionError, match="holds no captures"):
+    with pytest.raises(DescriptionError, match="contains no captures"):
         first_captures([path], config, told)
 
 

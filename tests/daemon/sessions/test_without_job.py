@@ -27,10 +27,10 @@ def test_each_reason_is_named(rig: JobRig) -> None:
     rig.session("new")
     rig.store.update("calibration_sessions", {"id": "new"}, {"excluded": "no control point was shot at its end"})
     found = reasons(rig)
-    assert "it is open" in str(found["open"])
+    assert "the session is open" in str(found["open"])
     assert "was aborted" in str(found["aborted"])
     assert "no model yet" in str(found["check"])
-    assert found["new"] == "calibration does not use it: no control point was shot at its end"
+    assert found["new"] == "calibration does not use the session: no control point was shot at its end"
     rig.store.update("calibration_sessions", {"id": "new"}, {"excluded": None})
     assert "queued within seconds" in str(reasons(rig)["new"])
     assert "[jobs] enabled = true" in str(reasons(rig, are_jobs_enabled=False)["new"])
@@ -41,7 +41,7 @@ def test_a_job_that_works_on_several_sessions_is_named_by_all_of_them(rig: JobRi
     rig.session("second")
     rig.start()
     rig.wait_for("done", "done", "done", "done")
-    assert reasons(rig) == {"first": "job 1, of session second, works on it too", "second": None}
+    assert reasons(rig) == {"first": "job 1 of session second includes this session", "second": None}
     assert rig.runner is not None
     jobs = rig.runner.list_command({})
     assert [job["session_id"] for job in jobs] == ["second"] * 4

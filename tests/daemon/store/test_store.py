@@ -68,7 +68,7 @@ def test_a_second_daemon_is_refused_and_told_who_holds_the_store(path: Path) -> 
     with holder:
         assert holder.stdout is not None
         assert holder.stdout.readline() == "open\n"
-        with pytest.raises(StoreBusyError, match=f"process {holder.pid} holds this store") as refused:
+        with pytest.raises(StoreBusyError, match=f"process {holder.pid} has this store open for writing") as refused:
             Store(path)
         assert refused.value.pid == holder.pid
         holder.kill()

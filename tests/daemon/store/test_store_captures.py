@@ -139,7 +139,7 @@ def test_a_chunk_that_was_written_wrongly_is_refused_though_its_checksum_is_righ
     if code == "B":
         wrong[-20:] = bytes(20)  # the packed columns themselves
     wrong += zlib.crc32(wrong).to_bytes(4, "little")
-    with pytest.raises(StoreError, match="makes no sense"):
+    with pytest.raises(StoreError, match="is invalid"):
         decode_captures(bytes(wrong))
 
 

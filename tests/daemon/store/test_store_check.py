@@ -91,7 +91,7 @@ def test_a_check_that_fails_by_a_fault_of_its_own_is_made_again_and_the_store_is
     clock = FaultyClock(at(0))
     with watched(path, clock=clock) as (_, watch):
         assert watch.health.state == "checking"
-        assert sum("made again" in record.message for record in caplog.records) == 1
+        assert sum("the check for damage has failed" in record.message for record in caplog.records) == 1
         clock.is_faulty = False
         assert settled(watch) == "ok"
     assert results(path) == ["ok"]

@@ -217,10 +217,14 @@ def test_lists_neither_fail_inside_the_daemon_nor_come_from_another_file_when_th
         assert request(config.socket_path, "session.list") == []
         config.store_path.rename(tmp_path / "aside")
         for command in ("session.list", "jobs.list"):
-            with pytest.raises(CommandError, match="replaced or removed while it ran; `rigcal status` says what to do"):
+            with pytest.raises(
+                CommandError, match="replaced or removed while the daemon ran; `rigcal status` shows what to do"
+            ):
                 request(config.socket_path, command)
         shutil.copy(tmp_path / "aside", config.store_path)
-        with pytest.raises(CommandError, match="replaced or removed while it ran; `rigcal status` says what to do"):
+        with pytest.raises(
+            CommandError, match="replaced or removed while the daemon ran; `rigcal status` shows what to do"
+        ):
             request(config.socket_path, "session.list")
 
 
@@ -287,7 +291,7 @@ def test_no_session_is_started_in_a_store_whose_file_is_gone(tmp_path: Path) -> 
         request(config.socket_path, "setup.new", {"id": "S1"})
         config.store_path.rename(tmp_path / "aside")
         wait_until(lambda: daemon.store_health.state == "missing")
-        with pytest.raises(CommandError, match=r"no session is started.*the file is gone"):
+        with pytest.raises(CommandError, match=r"no session is started.*the file that rigcal writes to is gone"):
             request(config.socket_path, "session.start", {"prism": "r"})
 
 

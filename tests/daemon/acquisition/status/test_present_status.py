@@ -133,7 +133,7 @@ def test_a_silent_station_is_not_locked_and_its_last_fix_not_ok(rig: Rig) -> Non
     rig.clock.advance(40.0)
     (station,) = rig.status().stations
     assert (station.status, station.lock, station.good_age_s) == ("silent", "unknown", pytest.approx(40.0))
-    assert station.sentence == "silent, not heard for 40 s (last: locked, ok)"
+    assert station.sentence == "silent, nothing received for 40 s (last: locked, ok)"
 
 
 def test_open_gaps_are_in_the_status_until_they_close_and_one_line_for_all_channels_of_a_link(rig: Rig) -> None:

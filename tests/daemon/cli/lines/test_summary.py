@@ -29,8 +29,8 @@ def alarm(number: int, severity: str = "critical") -> dict[str, Any]:
         "severity": severity,
         "kind": "joint_silent",
         "subject": f"theta{number}",
-        "text": f"theta{number} is not heard any more (last: ok), and this is a long text that is wrapped",
-        "remedy": "Check the encoder's power and cable; without it no fix can be used.",
+        "text": f"theta{number} is no longer received (last: ok), and this is a long text that is wrapped",
+        "remedy": "Check the encoder's power and cable; without this joint no fix can be used.",
         "age_s": 40.0,
         "since_utc_ns": 1_700_000_000_000_000_000,
     }

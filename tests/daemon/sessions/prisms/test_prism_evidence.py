@@ -81,8 +81,8 @@ def test_another_prism_from_a_session_s_first_fix_on_is_told_by_what_the_set_up_
     rig.stand(4, target)
     assert rig.used(session) == 0
     (suspicion,) = rig.keeper.prism_suspicions()
-    assert f"it fits prism {target}" in suspicion.reason
-    assert "where the joints put r" in texts(rig, EventKind.PRISM_JUMP)[-1]
+    assert f"and fits prism {target}" in suspicion.reason
+    assert "where the joints place r" in texts(rig, EventKind.PRISM_JUMP)[-1]
     rig.stand(5, "r")
     assert rig.keeper.prism_suspicions() == []
     assert rig.used(session) > 0
@@ -125,7 +125,7 @@ def test_another_prism_that_is_told_while_the_disk_fails_is_excluded_once_it_wor
     rig.observing = contextlib.nullcontext
     rig.stand(4, "s")
     assert rig.used(session) == 0
-    assert any("where the joints put r" in text for text in texts(rig, EventKind.PRISM_JUMP))
+    assert any("where the joints place r" in text for text in texts(rig, EventKind.PRISM_JUMP))
     observed = [row["monotonic_ns"] for row in table(rig.store.path, "observations")]
     assert len(observed) > 190, "none of those that waited is lost"
     assert observed == sorted(observed)
@@ -140,7 +140,7 @@ def test_a_reflector_that_stands_beside_the_machine_is_no_prism(rig: TrueRig) ->
         rig.target_mm = stands_mm
         rig.live(2)
     assert rig.used(session) == 0
-    assert "a reflector that stands still" in rig.keeper.prism_suspicions()[0].reason
+    assert "a stationary reflector" in rig.keeper.prism_suspicions()[0].reason
 
 
 def test_a_boom_that_moves_far_while_lock_is_lost_is_not_suspected(rig: TrueRig) -> None:

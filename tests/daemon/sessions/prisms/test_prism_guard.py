@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 import pytest
 
-from daemon.sessions.prisms.guard import MotionLimit, PrismGuard, Word
+from daemon.sessions.prisms.guard import MotionLimit, OperatorConfirmation, PrismGuard
 from drivers.clock import Stamp
 from drivers.readings import DeviceEvent, EventKind, Fix, LockState, Status
 from drivers.stations.config import StationConfig
@@ -33,7 +33,7 @@ class Watched:
 
     limit: MotionLimit = field(default_factory=MotionLimit)
     says_lock: bool = True
-    words: list[Word] = field(default_factory=list)
+    words: list[OperatorConfirmation] = field(default_factory=list)
     events: list[DeviceEvent] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -62,7 +62,7 @@ class Watched:
         self._see(Fix("station", at(start_s), at(start_s), Status.NOT_AVAILABLE, lock))
 
     def say(self, seconds: float, *, is_turning: bool = False) -> None:
-        self.words.append(Word(at(seconds), is_turning))
+        self.words.append(OperatorConfirmation(at(seconds), is_turning))
 
     def _see(self, fix: Fix) -> None:
         event = self.guard.see(fix)
@@ -96,7 +96,7 @@ def test_the_fixes_after_a_jump_are_in_doubt_with_when_how_far_and_what_to_do() 
     assert suspicion is not None
     assert (suspicion.station, suspicion.since, suspicion.distance_m) == ("station", at(0.5), pytest.approx(1.55))
     assert suspicion.reason == "perhaps another prism: the station's target jumped by 1.55 m"
-    assert "aim station at the prism again" in suspicion.remedy
+    assert "aim station at the session's prism" in suspicion.remedy
 
 
 def test_however_long_another_prism_is_followed_its_fixes_never_count() -> None:
@@ -116,8 +116,8 @@ def test_a_new_lock_on_another_prism_ends_no_suspicion() -> None:
     watched.no_prism(50)
     assert not any(watched.fixes(60, 20, 15))
     assert watched.told(EventKind.PRISM_JUMP)[1:] == [
-        "locked again 1.50 m from the prism: perhaps another one; its fixes still do not count",
-        "locked again 5.00 m from the prism: perhaps another one; its fixes still do not count",
+        "locked again 1.50 m from the prism: perhaps another prism; its fixes are still not used",
+        "locked again 5.00 m from the prism: perhaps another prism; its fixes are still not used",
     ]
 
 
@@ -154,7 +154,7 @@ def test_back_on_the_earlier_prism_the_fixes_count_again(is_locked_anew: bool) -
         watched.no_prism(1.0)
     assert all(watched.fixes(600, 5, 10.3))
     assert watched.guard.suspicion is None
-    assert watched.told(EventKind.LOCK_ACQUIRED) == ["the target is the earlier prism again; its fixes count"]
+    assert watched.told(EventKind.LOCK_ACQUIRED) == ["the target is the earlier prism again; its fixes are used again"]
 
 
 def test_another_prism_that_passes_the_place_of_the_earlier_one_stays_another() -> None:

@@ -62,7 +62,7 @@ def test_a_change_to_a_near_prism_between_two_fixes_never_counts(
     rig.follow("s", rate_deg_s, 4)
     rig.follow("s", 0.0, 6)
     (suspicion,) = rig.keeper.prism_suspicions()
-    assert "otherwise than the joints moved r" in suspicion.reason
+    assert "from the motion of r computed from the joints" in suspicion.reason
     rows = [row for row in table(rig.store.path, "observations") if row["session_id"] == session]
     assert not [row for row in rows if row["monotonic_ns"] > changed_ns and row["excluded"] is None]
     assert [row for row in rows if row["monotonic_ns"] <= changed_ns and row["excluded"] is None]

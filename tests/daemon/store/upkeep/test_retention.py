@@ -298,8 +298,8 @@ def test_the_log_says_of_want_of_room_what_is_true(
             run(housekeeping)
             assert housekeeping.state.has_nothing_left
             assert minutes_left(path) == list(range(minutes))
-            said = [record.getMessage() for record in caplog.records if "room" in record.getMessage()]
-            assert said == [f"{path}: little room is left, and nothing that may be deleted"]
+            said = [record.getMessage() for record in caplog.records if "space" in record.getMessage()]
+            assert said == [f"{path}: little space is left, and nothing more may be deleted"]
 
 
 def test_want_of_room_deletes_the_oldest_and_tells(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -321,8 +321,8 @@ def test_want_of_room_deletes_the_oldest_and_tells(tmp_path: Path, caplog: pytes
             assert not housekeeping.state.has_nothing_left
             run(housekeeping)
             assert housekeeping.state.deleted_until_utc_ns is not None
-            first = next(record.getMessage() for record in caplog.records if "room" in record.getMessage())
-            assert first == f"{path}: little room is left; the oldest captures outside sessions are deleted"
+            first = next(record.getMessage() for record in caplog.records if "space" in record.getMessage())
+            assert first == f"{path}: little space is left; the oldest captures outside sessions are deleted"
             assert minutes_left(path)[-1] == 399
             if housekeeping.state.is_short:
                 assert housekeeping.state.has_nothing_left
