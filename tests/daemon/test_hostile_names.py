@@ -328,7 +328,10 @@ def test_the_service_manager_is_told_one_state_a_line(tmp_path: Path) -> None:
         assert manager.recv(1000) == b"READY=1\nSTATUS=rig a\\nMAINPID=1"
 
 
-def test_titles_and_cells_of_tables_are_plain_too(capsys: pytest.CaptureFixture[str]) -> None:
+def test_titles_and_cells_of_tables_are_plain_too(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "1000")  # else a long cell is wrapped
     echo_table((MIXED,), [(MIXED,)], title=MIXED)
     echo_list("title", [MIXED])
     echo(MIXED, bold=True)

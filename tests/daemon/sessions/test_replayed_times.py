@@ -120,6 +120,6 @@ def test_a_replay_tells_how_many_observations_can_be_used_and_why_others_cannot(
     result = replayed(tmp_path, SIMULATED / "moving" / "boom.log", until_ns=LAST_NS + 60 * NS_PER_S)
     assert result.exit_code == 0, result.output
     number = {what: int(n) for n, what in re.findall(r"^ *(\d+) (.+)$", result.output, re.MULTILINE)}
-    unusable = sum(n for what, n in number.items() if what.startswith("cannot: "))
+    unusable = sum(n for what, n in number.items() if what.startswith("cannot be used: "))
     assert 0 < number["of these observations can be used"] < number["observations"]
     assert number["of these observations can be used"] + unusable == number["observations"]

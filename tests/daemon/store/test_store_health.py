@@ -291,7 +291,7 @@ def test_no_session_is_started_in_a_store_whose_file_is_gone(tmp_path: Path) -> 
         request(config.socket_path, "setup.new", {"id": "S1"})
         config.store_path.rename(tmp_path / "aside")
         wait_until(lambda: daemon.store_health.state == "missing")
-        with pytest.raises(CommandError, match=r"no session is started.*the file that rigcal writes to is gone"):
+        with pytest.raises(CommandError, match=r"the session is not started.*the file that rigcal writes to is gone"):
             request(config.socket_path, "session.start", {"prism": "r"})
 
 
