@@ -65,7 +65,7 @@ class Caller:
 
 
 _current: ContextVar[Caller | None] = ContextVar("caller", default=None)
-_has_left: ContextVar[Callable[[], bool]] = ContextVar("has_left", default=lambda: False)
+_is_cancelled: ContextVar[Callable[[], bool]] = ContextVar("is_cancelled", default=lambda: False)
 
 
 def current_caller() -> Caller | None:
@@ -80,31 +80,31 @@ def caller_columns(prefix: str = "") -> dict[str, str | int | None]:
     return {f"{prefix}caller_user": user, f"{prefix}caller_uid": uid, f"{prefix}caller_pid": pid}
 
 
-def caller_has_left() -> bool:
+def is_cancelled() -> bool:
     """Return True if the caller of this thread's command has disconnected (Ctrl-C, a closed terminal)."""
-    return _has_left.get()()
+    return _is_cancelled.get()()
 
 
-def go_on_for_caller() -> None:
+def raise_if_cancelled() -> None:
     """Raise CommandError if the caller of this thread's command has disconnected."""
-    if caller_has_left():
+    if is_cancelled():
         raise CommandError("cancelled, because its caller has disconnected; work done so far is kept", FAILED)
 
 
 @contextlib.contextmanager
-def acting_for(caller: Caller | None, has_left: Callable[[], bool] = lambda: False) -> Iterator[None]:
+def acting_for(caller: Caller | None, is_cancelled: Callable[[], bool] = lambda: False) -> Iterator[None]:
     """Set the current caller of this thread.
 
     Args:
         caller: the caller; None for nobody.
-        has_left: returns True once the caller has disconnected.
+        is_cancelled: returns True once the caller has disconnected.
     """
-    token, left_token = _current.set(caller), _has_left.set(has_left)
+    token, left_token = _current.set(caller), _is_cancelled.set(is_cancelled)
     try:
         yield
     finally:
         _current.reset(token)
-        _has_left.reset(left_token)
+        _is_cancelled.reset(left_token)
 
 
 # ---- arguments -------------------------------------------------------------------------------------------------------

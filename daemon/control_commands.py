@@ -9,7 +9,7 @@ from typing import Any
 
 from daemon.acquisition.redecoding import redecode_command
 from daemon.alarms.board import AlarmBoard
-from daemon.commands import FAILED, REFUSED, CommandError, Handler, go_on_for_caller, reading_socket, text_argument
+from daemon.commands import FAILED, REFUSED, CommandError, Handler, raise_if_cancelled, reading_socket, text_argument
 from daemon.composition import Parts
 from daemon.config.config import Config
 from daemon.control.command_table import checked_arguments
@@ -147,11 +147,11 @@ class Commands:
 
     def _prune(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
         """Delete captures and readings outside sessions that are older than a number of days."""
-        return self.housekeeping.prune_command(arguments, go_on_for_caller)
+        return self.housekeeping.prune_command(arguments, raise_if_cancelled)
 
     def _redecode(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
         """Decode the raw captures of a session or of a time span again into readings and fixes."""
-        return redecode_command(self.store, self.parts.rig, self.parts.decoders, arguments, go_on_for_caller)
+        return redecode_command(self.store, self.parts.rig, self.parts.decoders, arguments, raise_if_cancelled)
 
     def _configure_devices(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
         """Set up CANopen devices, if the operator confirms that the machine is parked."""

@@ -159,12 +159,12 @@ class Acquisition:
             log.critical("%s: a write does not finish; stopping without it", self._store.path)
         lost = self._unstored + sum(intake.unstored for intake in self._intakes)
         if lost:
-            self._give_up(f"{lost} captures could not be stored before the shutdown")
+            self._fail(f"{lost} captures could not be stored before the shutdown")
         elif self._decoded is not None or not self._backlog.is_empty:
             log.warning("all captures are stored; the next start decodes those that are not decoded yet")
         return not self._writer.is_alive()
 
-    def _give_up(self, why: str) -> None:
+    def _fail(self, why: str) -> None:
         log.critical("%s", why)
         self._failure = AcquisitionError(why)
 

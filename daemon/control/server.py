@@ -295,7 +295,7 @@ class ControlServer:
         client.received = bytearray(rest)
         return line
 
-    def _answer(self, line: bytes, caller: Caller, has_left: Callable[[], bool]) -> bytes:
+    def _answer(self, line: bytes, caller: Caller, is_cancelled: Callable[[], bool]) -> bytes:
         command: str | None = None
         try:
             command, arguments = parse_request(line)
@@ -304,7 +304,7 @@ class ControlServer:
                 raise CommandError(f"unknown command {command!r:.80}; known: {', '.join(sorted(self._handlers))}")
             if command not in READING:
                 log.info("%s, requested by %s%s", command, caller, _on_behalf(arguments))
-            with acting_for(caller, has_left):
+            with acting_for(caller, is_cancelled):
                 return answer_line(handler(arguments))
         except CommandError as error:
             return refusal_line(str(error), error.status)

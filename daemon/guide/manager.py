@@ -175,7 +175,7 @@ class GuideManager:
         if not isinstance(rest, bool):
             raise CommandError(f"rest must be true or false, not {rest!r:.80}")
         self._record.needs_step(arguments)
-        self._worker.give_up()
+        self._worker.cancel()
         with self._record.turn:
             job, _ = self._record.needs_step(arguments)
             step = job.step
@@ -212,7 +212,7 @@ class GuideManager:
         """Abandon the guide; its open session is closed if it has poses, else aborted."""
         reason = _reason(arguments)
         self._record.needs_step({})
-        self._worker.give_up()
+        self._worker.cancel()
         with self._record.turn:
             self._record.needs_step({})
             with self._course.at_once():

@@ -82,7 +82,7 @@ class GuideWorker:
         if self._thread.is_alive():
             self._thread.join(timeout=_CANCEL_S)
 
-    def give_up(self) -> None:
+    def cancel(self) -> None:
         """Cancel a shot that is in progress."""
         if not self.busy:
             return

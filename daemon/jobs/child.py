@@ -13,7 +13,7 @@ from typing import IO, Any
 
 from daemon.host.systemd import parse_line
 from daemon.jobs.job_processes import END_TIMEOUT_S, ChildProcess, JobProcess, UnitProcess
-from daemon.jobs.order import Order, Outcome, Progress, Started, parse_message
+from daemon.jobs.order import Order, Outcome, ProgressMessage, Started, parse_message
 
 log = logging.getLogger(__name__)
 
@@ -69,7 +69,7 @@ class JobChild:
         with contextlib.suppress(OSError):
             self._process.orders.close()
 
-    def next_message(self, timeout_s: float) -> Started | Progress | Outcome | None:
+    def next_message(self, timeout_s: float) -> Started | ProgressMessage | Outcome | None:
         """Return the next message of the process, including its end; None if none arrives within `timeout_s`."""
         try:
             line = self._lines.get(timeout=timeout_s)

@@ -11,7 +11,7 @@ from typing import Any
 
 from daemon.commands import CHECK, REFUSED, CommandError
 from daemon.config.config import Config
-from daemon.jobs.order import Order, Outcome, Progress
+from daemon.jobs.order import Order, Outcome, ProgressMessage
 from daemon.jobs.scheduler import CHECKS, DueChain, State
 from daemon.models.drift import note_drift, unseen_checks
 from daemon.store.queries.guides import GuideTable
@@ -199,7 +199,7 @@ class JobQueue:
         """Store the process id of a running job."""
         self.table.change(job_id, pid=pid)
 
-    def note_progress(self, job_id: int, progress: Progress) -> None:
+    def note_progress(self, job_id: int, progress: ProgressMessage) -> None:
         """Store the progress of a running job."""
         self.table.change(job_id, progress=progress.share, message=progress.message)
 

@@ -78,8 +78,8 @@ class Started:
 
 
 @dataclass(frozen=True)
-class Progress:
-    """Progress of a job.
+class ProgressMessage:
+    """ProgressMessage of a job.
 
     Attributes:
         share: share of the work that is done, 0 to 1.
@@ -105,7 +105,7 @@ class Outcome:
     result: Mapping[str, Any] | None = None
 
 
-def parse_message(line: bytes) -> Started | Progress | Outcome:
+def parse_message(line: bytes) -> Started | ProgressMessage | Outcome:
     """Parse a line from a job's process; a line that is not a message counts as failure of the job."""
     try:
         message = json.loads(line)
@@ -115,7 +115,7 @@ def parse_message(line: bytes) -> Started | Progress | Outcome:
         case {"pid": int() as pid}:
             return Started(pid)
         case {"progress": float() | int() as share, "message": str() as text} if -math.inf < share < math.inf:
-            return Progress(float(min(max(share, 0), 1)), text)
+            return ProgressMessage(float(min(max(share, 0), 1)), text)
         case {"result": dict() as result}:
             return Outcome("done", result=result)
         case {"error": str() as error}:

@@ -145,7 +145,7 @@ class JobRunner:
         if self._is_held():
             return False
         for job in spent_jobs(state, max_attempts=self._settings.max_attempts):
-            self._give_up(job)
+            self._abandon(job)
         due = due_jobs(state, self._clock.now(), max_attempts=self._settings.max_attempts)
         for item in due:
             if isinstance(item, DueChain):
@@ -160,7 +160,7 @@ class JobRunner:
         self._perform(next_one)
         return True
 
-    def _give_up(self, job: JobFacts) -> None:
+    def _abandon(self, job: JobFacts) -> None:
         if job.attempts >= self._settings.max_attempts:
             often = f"interrupted {job.attempts} times, the most that [jobs] max_attempts allows"
         else:

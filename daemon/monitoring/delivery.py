@@ -110,7 +110,7 @@ class _Post(threading.Thread):
         self.start()
         self.join(self._longest_s)
         if self.is_alive():
-            self._give_up()
+            self._cancel()
             raise TimeoutError(f"no complete answer within {self._longest_s:g} s")
         if self._error is not None:
             raise self._error
@@ -132,9 +132,9 @@ class _Post(threading.Thread):
         with self._turn:
             self._lines.append(line.dup())  # a duplicate, as TLS takes over the socket itself
         if self._is_over:
-            self._give_up()
+            self._cancel()
 
-    def _give_up(self) -> None:
+    def _cancel(self) -> None:
         self._is_over = True
         with self._turn:
             for line in self._lines:

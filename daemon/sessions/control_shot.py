@@ -8,7 +8,7 @@ import threading
 from concurrent.futures import Future
 from dataclasses import dataclass, field
 
-from daemon.commands import FAILED, CommandError, caller_has_left
+from daemon.commands import FAILED, CommandError, is_cancelled
 from daemon.sessions.station_setups import Place
 from drivers.clock import Clock, Order, Stamp, lies_within
 from drivers.readings import Fix, Status
@@ -74,7 +74,7 @@ class Shot:
         while left_s > 0 and not is_complete:
             is_complete = clock.wait(arrived, min(left_s, _LOOK_S))
             left_s -= _LOOK_S
-            if caller_has_left():
+            if is_cancelled():
                 log.info("a shot of a control point was cancelled: its caller has disconnected")
                 raise CommandError("the shot was cancelled, and nothing was stored", FAILED)
         if not is_complete:

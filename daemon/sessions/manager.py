@@ -22,8 +22,8 @@ from daemon.commands import (
     SESSION_KINDS,
     CommandError,
     caller_columns,
-    go_on_for_caller,
     identifier,
+    raise_if_cancelled,
     text_argument,
 )
 from daemon.config.sections import SessionsSection
@@ -179,7 +179,7 @@ class SessionManager:
             self._prisms.prepare(LOAD_S)
             if self._aim is not None:
                 self._aim(prism)
-            go_on_for_caller()
+            raise_if_cancelled()
             with self._store.transaction():
                 session = self._new_session(prism, kind, arguments, is_aimed=is_aimed)
             return {

@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 
-from daemon.commands import REFUSED, CommandError, caller_has_left, reading_socket
+from daemon.commands import REFUSED, CommandError, is_cancelled, reading_socket
 from daemon.control.protocol import request
 from daemon.control.server import ControlServer, Limits
 from daemon.host.systemd import Notifier
@@ -186,7 +186,7 @@ def test_a_command_knows_when_nobody_waits_for_its_answer_any_more(tmp_path: Pat
 
     def shoot(_arguments: Mapping[str, Any]) -> str:
         began.set()
-        wait("the client to leave", caller_has_left)
+        wait("the client to leave", is_cancelled)
         ended.set()
         return "shot"
 
@@ -198,7 +198,7 @@ def test_a_command_knows_when_nobody_waits_for_its_answer_any_more(tmp_path: Pat
 
 def test_a_client_that_has_no_more_to_say_still_waits_for_its_answer(tmp_path: Path) -> None:
     with (
-        serving(tmp_path / "s", {"shoot": lambda _: caller_has_left()}),
+        serving(tmp_path / "s", {"shoot": lambda _: is_cancelled()}),
         connected(tmp_path / "s", b'{"command": "shoot"}\n') as client,
         client.makefile("rb") as stream,
     ):

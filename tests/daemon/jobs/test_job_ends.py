@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from daemon.jobs.child import JobChild
 from daemon.jobs.job_queue import JobQueue
-from daemon.jobs.order import Order, Outcome, Progress, Started, parse_message
+from daemon.jobs.order import Order, Outcome, ProgressMessage, Started, parse_message
 from drivers.clock import NS_PER_S
 from tests.daemon.support.jobs import JobRig, is_gone
 
@@ -228,14 +228,14 @@ def test_an_interrupted_job_waits_before_it_runs_again_and_can_be_cancelled_mean
 @pytest.mark.parametrize(
     ("line", "message"),
     [
-        (b'{"progress": 1, "message": "x"}\n', Progress(1.0, "x")),
-        (b'{"progress": 1.0000001, "message": "x"}\n', Progress(1.0, "x")),
-        (b'{"progress": 1%b, "message": "x"}\n' % (b"0" * 400), Progress(1.0, "x")),
+        (b'{"progress": 1, "message": "x"}\n', ProgressMessage(1.0, "x")),
+        (b'{"progress": 1.0000001, "message": "x"}\n', ProgressMessage(1.0, "x")),
+        (b'{"progress": 1%b, "message": "x"}\n' % (b"0" * 400), ProgressMessage(1.0, "x")),
         (b'{"result": {"model": null}}\n', Outcome("done", result={"model": None})),
         (b'{"error": "too poor"}\n', Outcome("failed", "too poor")),
     ],
 )
-def test_a_message_is_what_it_says(line: bytes, message: Progress | Outcome) -> None:
+def test_a_message_is_what_it_says(line: bytes, message: ProgressMessage | Outcome) -> None:
     assert parse_message(line) == message
 
 
@@ -248,7 +248,7 @@ JSON = st.recursive(
 @given(st.binary() | JSON.map(lambda value: json.dumps(value).encode()))
 def test_any_line_is_progress_or_an_end(line: bytes) -> None:
     message: Any = parse_message(line)
-    if isinstance(message, Progress):
+    if isinstance(message, ProgressMessage):
         assert 0.0 <= message.share <= 1.0
     else:
         assert message.state == ("done" if message.result is not None else "failed")
