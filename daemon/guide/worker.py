@@ -18,6 +18,7 @@ from daemon.guide.course import Course
 from daemon.guide.job import Job
 from daemon.guide.position import is_there, joints_of
 from daemon.guide.request import misfit
+from daemon.host.worker_thread import WorkerThread
 from daemon.sessions.manager import SessionManager
 from daemon.sessions.open_session import CONTROL_POINT_RADIUS_MM
 from daemon.sessions.station_setups import StationSetups
@@ -36,7 +37,7 @@ Drive = Callable[[Sequence[Mapping[str, Any]]], int]
 """Sends the boom to the rows of a pose plan; returns the number of remaining stops."""
 
 
-class GuideWorker:
+class GuideWorker(WorkerThread):
     """Advances the open guide.
 
     Args:
@@ -64,23 +65,18 @@ class GuideWorker:
         has_aim: bool,
         drive: Drive | None,
     ) -> None:
+        super().__init__("guide", _CANCEL_S)
         self.wanted = self.busy = ""
         self._rig, self._course, self._sessions, self._setups, self._clock = rig, course, sessions, setups, clock
         self._has_aim, self._drive = has_aim, drive
         self._driven = ("", 0)  # step whose pose the boom was sent to, and when
-        self._cancelled, self._stopping = threading.Event(), threading.Event()
-        self._thread = threading.Thread(target=self._run, name="guide", daemon=True)
-
-    def start(self) -> None:
-        """Start the thread."""
-        self._thread.start()
+        self._cancelled = threading.Event()
 
     def stop(self) -> None:
-        """Stop the thread."""
+        """Cancel a shot that is in progress, and end the thread."""
         self._stopping.set()
         self._cancelled.set()
-        if self._thread.is_alive():
-            self._thread.join(timeout=_CANCEL_S)
+        super().stop()
 
     def cancel(self) -> None:
         """Cancel a shot that is in progress."""

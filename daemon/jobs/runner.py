@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import logging
 import sqlite3
-import threading
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from daemon.commands import REFUSED, CommandError
 from daemon.config.config import Config
+from daemon.host.worker_thread import WorkerThread
 from daemon.jobs.child import JOB_COMMAND, JobChild
 from daemon.jobs.job_queue import CANCELLED, STOPPED, JobQueue
 from daemon.jobs.order import Outcome, Started
@@ -31,8 +31,10 @@ LISTEN_S = 0.2  # how often a running job that sends nothing is checked
 STOP_TIMEOUT_S = 30.0
 
 
-class JobRunner:
+class JobRunner(WorkerThread):
     """Queues and runs jobs until stopped.
+
+    `stop` ends the running job, which is marked interrupted and queued again after the next start.
 
     Args:
         store: where jobs, their results and models are written.
@@ -57,6 +59,7 @@ class JobRunner:
         is_held: Callable[[], bool] = lambda: False,
         work_clock: Clock | None = None,
     ) -> None:
+        super().__init__("jobs", STOP_TIMEOUT_S)
         self._settings = config.jobs
         self._config = config
         self._clock = clock
@@ -66,21 +69,9 @@ class JobRunner:
         self._host_boot = self._work_clock.now().boot_id
         self._store = store
         self._queue = JobQueue(store, rig_name, clock)
-        self._stopping = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="jobs", daemon=True)
         self._is_computer_at_fault = False  # whether the last step failed through no fault of a job
         self._told = ""  # the last error of this thread that was logged
         store.unless_damaged(lambda: self._queue.interrupt_left_over(self._host_boot), None)
-
-    def start(self) -> None:
-        """Start the thread that queues and runs jobs."""
-        self._thread.start()
-
-    def stop(self) -> None:
-        """End the thread and the running job, which is marked interrupted and queued again after the next start."""
-        self._stopping.set()
-        if self._thread.is_alive():
-            self._thread.join(timeout=STOP_TIMEOUT_S)
 
     def compare(self, model: ModelRow) -> str:
         """Queue a comparison of a model with the live model, and return a sentence for the operator.

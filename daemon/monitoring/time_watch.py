@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import logging
-import threading
 from collections.abc import Callable
 from dataclasses import asdict
 from typing import Any
 
 from daemon.host.time_service import ClockState
+from daemon.host.worker_thread import WorkerThread
 from drivers.clock import NS_PER_S, Clock, Stamp
 
 log = logging.getLogger(__name__)
@@ -17,7 +17,7 @@ EVERY_S = 60.0
 STOP_S = 5.0
 
 
-class TimeWatch:
+class TimeWatch(WorkerThread):
     """Reads the state of the computer's clock in its own thread, because an answer may take seconds.
 
     Only a clock that was synchronised and no longer is counts as a loss: a rig without a network never is.
@@ -28,23 +28,11 @@ class TimeWatch:
     """
 
     def __init__(self, read: Callable[[], ClockState], clock: Clock) -> None:
+        super().__init__("clock", STOP_S)
         self._read, self._clock = read, clock
-        self._stopping = threading.Event()
-        self._thread: threading.Thread | None = None
         self._known: tuple[ClockState, Stamp] | None = None
         self._kept: Stamp | None = None  # when it was last seen to be synchronised
         self._told = ""
-
-    def start(self) -> None:
-        """Start the thread."""
-        self._thread = threading.Thread(target=self._run, name="clock", daemon=True)
-        self._thread.start()
-
-    def stop(self) -> None:
-        """Stop the thread; harmless if it was not started."""
-        self._stopping.set()
-        if self._thread is not None:
-            self._thread.join(STOP_S)
 
     def look(self) -> None:
         """Read the state now."""

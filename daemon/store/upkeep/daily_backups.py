@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import logging
-import threading
 from pathlib import Path
 
 from daemon.host.priority import UPKEEP_NICE, lower_priority
 from daemon.host.safe_output import duration
+from daemon.host.worker_thread import WorkerThread
 from daemon.store.errors import StoreError
 from daemon.store.upkeep.backup import backups, make_backup
 from drivers.clock import NS_PER_S, Clock, SystemClock
@@ -26,7 +26,7 @@ class _StoppedError(Exception):
     """The daemon is stopping; the running backup is cancelled."""
 
 
-class DailyBackups:
+class DailyBackups(WorkerThread):
     """Makes daily backups, the first of a run after some minutes.
 
     Args:
@@ -41,26 +41,14 @@ class DailyBackups:
     """
 
     def __init__(self, store: Path, models: Path, directory: Path, keep: int, clock: Clock) -> None:
+        super().__init__("backups", STOP_S)
         self._store, self._models, self._directory, self._keep, self._clock = store, models, directory, keep, clock
         self._real = SystemClock()
         self._next_ns = self._real.monotonic_ns() + round(BACKUP_AFTER_S * NS_PER_S)
         self._is_known = False
         self._since_ns: int | None = None  # when the running step began
         self._error = ""
-        self._stopping = threading.Event()
-        self._thread: threading.Thread | None = None
         self.newest_utc_ns: int | None = None
-
-    def start(self) -> None:
-        """Start the thread."""
-        self._thread = threading.Thread(target=self._run, name="backups", daemon=True)
-        self._thread.start()
-
-    def stop(self) -> None:
-        """Stop the thread and cancel a running backup. Harmless when not started."""
-        self._stopping.set()
-        if self._thread is not None:
-            self._thread.join(STOP_S)
 
     def error(self) -> str:
         """Return why the last backup failed, or has not ended; "" if nothing is wrong."""

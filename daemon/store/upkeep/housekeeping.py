@@ -16,6 +16,7 @@ from typing import Any
 
 from daemon.commands import CommandError, number_argument
 from daemon.host.priority import UPKEEP_NICE, lower_priority
+from daemon.host.worker_thread import WorkerThread
 from daemon.store.errors import StoreError, storage_sentence
 from daemon.store.store import Store
 from daemon.store.upkeep.daily_backups import DailyBackups
@@ -76,7 +77,7 @@ class KeepingState:
     has_backups: bool = False
 
 
-class Housekeeping:
+class Housekeeping(WorkerThread):
     """Maintains a store, in its own threads.
 
     Args:
@@ -86,14 +87,13 @@ class Housekeeping:
     """
 
     def __init__(self, store: Store, clock: Clock, keeping: Keeping) -> None:
+        super().__init__("housekeeping", STOP_S)
         self._store, self._clock, self._keeping = store, clock, keeping
         self._packing, self._retention = Packing(store), Retention(store, clock)
         self._real = SystemClock()
         self._told = ""
         self._told_of_room: set[str] = set()
         self._turn = threading.Lock()  # for steps, because a command may delete as well
-        self._stopping = threading.Event()
-        self._thread: threading.Thread | None = None
         self._began_ns = self._real.monotonic_ns()
         self._next_room_s = 0.0
         self._aged_until: tuple[float, int] | None = None  # running time of the next pass by age, and where it ends
@@ -116,16 +116,14 @@ class Housekeeping:
         """Start the threads."""
         if self._backups is not None:
             self._backups.start()
-        self._thread = threading.Thread(target=self._run, name="housekeeping", daemon=True)
-        self._thread.start()
+        super().start()
 
     def stop(self) -> None:
         """Stop after the running step. Harmless when not started."""
-        self._stopping.set()
+        self._stopping.set()  # both end side by side
         if self._backups is not None:
             self._backups.stop()
-        if self._thread is not None:
-            self._thread.join(STOP_S)
+        super().stop()
 
     def _run(self) -> None:
         lower_priority(UPKEEP_NICE)
