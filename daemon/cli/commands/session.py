@@ -16,8 +16,10 @@ from daemon.cli.lines.state import show_session
 from daemon.cli.terminal import echo, echo_error, echo_table
 from daemon.commands import SESSION_KINDS
 from daemon.control.protocol import request
+from daemon.sessions.export.table_formats import table_formats
 
 SHOT_TIMEOUT_S = 600.0
+_LOG_FORMATS = ("log", "candump", "asc", "blf")
 
 
 @click.group()
@@ -150,25 +152,25 @@ def session_show(name: str, **where: Any) -> Any:
 @click.option(
     "--format",
     "form",
-    type=click.Choice(["log", "candump", "asc", "blf", "csv", "parquet", "mat"]),
+    type=click.Choice([*_LOG_FORMATS, *table_formats()]),
     default="log",
     show_default=True,
-    help="CAN logs of candump (log, candump) or Vector (asc, blf), or tables (csv, parquet, mat).",
+    help=f"CAN logs of candump (log, candump) or Vector (asc, blf), or tables ({', '.join(table_formats())}).",
 )
 @json_option
 def session_export(name: str, config: Path, out: Path, form: Any, *, as_json: bool) -> Any:
     """Write captures or measurements of a session to files.
 
     log, candump, asc, blf: CAN and serial captures as logs for `rigcal replay`, and the observations as CSV.
-    csv, parquet, mat: the observations, all joint readings and all fixes as tables.
+    The other formats: the observations, all joint readings and all fixes as tables.
     """
     from daemon.config.config import read_config
     from daemon.sessions.export.captured_logs import export_session
-    from daemon.sessions.export.tables import TABLE_FORMATS, export_tables
+    from daemon.sessions.export.tables import export_tables
 
     settings = read_config(config)
-    if form in TABLE_FORMATS:
-        files = export_tables(settings.store_path, name, out, form)
+    if form in table_formats():
+        files = export_tables(settings.store_path, name, out, table_formats()[form])
     else:
         files = export_session(settings, name, out, "log" if form == "candump" else form)
     if not as_json:
