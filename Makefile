@@ -91,7 +91,8 @@ imports: environment
 	$(BIN)/lint-imports
 
 # Some of every room, and nothing that starts a daemon.
-QUICK := tests/drivers tests/daemon/store tests/daemon/report tests/calibration/numerics tests/calibration/rig tests/simulators/devices
+QUICK := tests/drivers tests/daemon/store tests/daemon/report tests/daemon/alarms tests/daemon/config tests/daemon/cli/lines \
+	tests/calibration/numerics tests/calibration/rig tests/calibration/kinematics tests/simulators/devices
 
 quick: environment
 	$(BIN)/python -m pytest -q -n auto --dist loadfile -m "not slow and not long" $(QUICK)

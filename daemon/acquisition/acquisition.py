@@ -8,21 +8,19 @@ chunks before its own (`daemon.acquisition.backlog`). A replay runs the same wri
 
 from __future__ import annotations
 
-import heapq
 import logging
 import sqlite3
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from operator import itemgetter
 from typing import TypeVar
 
 from daemon.acquisition.backlog import BATCH_CAPTURES, Backlog, Batch
 from daemon.acquisition.clock_watch import ClockWatch
 from daemon.acquisition.link_decoders import TICK_NS, LinkDecoders
-from daemon.acquisition.link_intake import LinkIntake, stamp_of
+from daemon.acquisition.link_intake import LinkIntake, in_time_order, stamp_of
 from daemon.acquisition.status.board import StatusBoard
 from daemon.acquisition.status.present import NOTHING_EXPECTED, Expected
 from daemon.acquisition.status.snapshot import AcquisitionStatus
@@ -241,7 +239,7 @@ class Acquisition:
         if not items:
             return read_until
         if len(items) > BATCH_CAPTURES:
-            items = _in_time_order(queues)
+            items = in_time_order(queues)
         self._unstored = sum(isinstance(item, CanCapture | SerialCapture) for item in items)
         batches = self._insist(partial(self._commit_raw, items))
         self._unstored = 0
@@ -434,18 +432,6 @@ class _Decoded:
     chunk_ids: Sequence[int]
     reports: Sequence[Record]
     records: Sequence[Record]
-
-
-def _in_time_order(queues: Iterable[Sequence[LinkItem]]) -> list[LinkItem]:
-    """Return the items of all links in order of time, so that a batch covers one period; each link's order is kept."""
-
-    def keyed(items: Sequence[LinkItem]) -> Iterator[tuple[int, LinkItem]]:
-        newest_ns = -(2**63)
-        for item in items:
-            newest_ns = max(newest_ns, stamp_of(item).monotonic_ns)
-            yield newest_ns, item
-
-    return [item for _, item in heapq.merge(*map(keyed, queues), key=itemgetter(0))]
 
 
 def _tell_of_links(reports: Iterable[Record]) -> None:

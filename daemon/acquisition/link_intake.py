@@ -5,10 +5,13 @@ The time from the start of the run until the link's port is open is recorded as 
 
 from __future__ import annotations
 
+import heapq
 import logging
 import threading
 from collections import deque
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from operator import itemgetter
 
 from drivers.clock import NS_PER_S, Clock, Stamp
 from drivers.readings import (
@@ -178,6 +181,18 @@ class LinkIntake:
 def stamp_of(record: LinkItem | Record) -> Stamp:
     """Return the stamp of a record, or the start of a gap."""
     return record.start if isinstance(record, Gap) else record.stamp
+
+
+def in_time_order(queues: Iterable[Sequence[LinkItem]]) -> list[LinkItem]:
+    """Return the items of all links in order of time, so that a batch covers one period; each link's order is kept."""
+
+    def keyed(items: Sequence[LinkItem]) -> Iterator[tuple[int, LinkItem]]:
+        newest_ns = -(2**63)
+        for item in items:
+            newest_ns = max(newest_ns, stamp_of(item).monotonic_ns)
+            yield newest_ns, item
+
+    return [item for _, item in heapq.merge(*map(keyed, queues), key=itemgetter(0))]
 
 
 def _first_word(item: LinkItem) -> Stamp | None:
