@@ -92,10 +92,10 @@ imports: environment
 
 # Some of every room, and nothing that starts a daemon.
 QUICK := tests/drivers tests/daemon/store tests/daemon/report tests/daemon/alarms tests/daemon/config tests/daemon/cli/lines \
-	tests/calibration/numerics tests/calibration/rig tests/calibration/kinematics tests/simulators/devices
+	tests/calibration/numerics tests/calibration/rig tests/simulators/devices
 
 quick: environment
-	$(BIN)/python -m pytest -q -n auto --dist loadfile -m "not slow and not long" $(QUICK)
+	$(BIN)/python -m pytest -q -n $(shell echo $$(($$(nproc) + 1))) --dist loadfile -m "not slow and not long" $(QUICK)
 
 check: ## lint and a quick part of the tests, in a minute: before each commit
 	@$(MAKE) --no-print-directory -j2 --output-sync=target types quick imports style
