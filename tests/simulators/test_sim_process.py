@@ -218,7 +218,7 @@ def test_an_unplugged_port_comes_back(rig: Process) -> None:
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["--rig", "nowhere"], b"no shipped rig"),
+        (["--rig", "nowhere"], b"not a shipped rig"),
         (["--effects", "rust@boom"], b"unknown effect"),
         (["--faults", "node_silent@1:node=99"], b"no node 99"),
         (["--rate", "0"], b"must be positive"),

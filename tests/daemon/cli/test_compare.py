@@ -80,7 +80,7 @@ def test_a_person_gets_a_table_reasons_shared_rows_and_the_page_s_path(torso: li
     assert "*" in best
     assert sum("not applicable" in line for line in lines if "masses" not in line) == 2
     assert sum("masses" in line for line in lines) == 2
-    assert "1 of the 41 rows of test.csv are rows of train.csv as well, the first in line 42: " in result.stdout
+    assert "1 of the 41 rows of test.csv are rows of train.csv as well, the first in line 42; " in result.stdout
     assert "comparison-torso.html" in lines[-1]
 
 

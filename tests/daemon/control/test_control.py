@@ -173,7 +173,7 @@ def test_json_that_no_command_can_use_is_one_refusal(path: Path, line: bytes) ->
     answer = talk(path, line)
     assert answer["ok"] is False
     assert answer["status"] == 2
-    assert answer["error"].startswith("a request")
+    assert "a request" in answer["error"]
     assert len(answer["error"]) < 200
     assert request(path, "echo", {"still": "here"}) == {"still": "here"}
 

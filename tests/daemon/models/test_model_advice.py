@@ -70,7 +70,7 @@ def test_a_model_that_was_compared_with_another_live_model_is_not_recommended(ri
     live, waiting = stale(rig)
     told = advice(rig)
     assert "model accept" not in told
-    assert f"no model was live, and model {live} is live now" in told
+    assert f"no model was live, but model {live} is live now" in told
     with pytest.raises(CommandError) as refused:
         rig.registry.accept_command({"id": waiting})
     assert str(refused.value) in told, "status gives the reason that accepting would give"
