@@ -1,4 +1,4 @@
-"""`python -m docs.references [FILE ...]`: makes pages of docs/reference anew, all of them by default."""
+"""`python -m docs.references [FILE ...]`: regenerates pages of docs/reference, by default all."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""docs/reference/alarms.md: every rule, its meaning and its remedy."""
+"""docs/reference/alarms.md: every alarm rule with its meaning and remedy."""
 
 from __future__ import annotations
 
@@ -7,45 +7,47 @@ from daemon.alarms.library import library
 
 _HEAD = """# Alarms
 
-What is wrong, since when, and what to do: `rigcal alarms` shows the active ones, `rigcal alarms --all` those that are
-over as well; `rigcal status` begins with them. Each is a line in the log when it is raised (warning or error) and when
-it is over (info), and a row of the store's table `alarms`.
+An alarm reports what is wrong, since when, and what to do. `rigcal alarms` shows the active alarms, and
+`rigcal alarms --all` also those that have ended; `rigcal status` begins with the active ones. Each alarm is logged when
+it is raised (warning or error) and when it ends (info), and is a row of the store's table `alarms`.
 
-A *critical* alarm: data are lost, or cannot be used. A *warning*: measuring goes on, and someone should look.
+A *critical* alarm means that data are lost or cannot be used. A *warning* means that measuring continues, and someone
+should check the rig.
 
-Alarms are raised and cleared by what is known at the moment, once a second; nobody acknowledges them. One that stands
-when rigcal is stopped goes on, with its old time, if its reason is still there 15 s after the next start.
+Alarms are raised and cleared once a second from the present state; nobody acknowledges them. An alarm that is active
+when rigcal is stopped continues, with its original time, if its cause is still there 15 s after the next start.
 
 ## Notices
 
-Alarms leave the machine where the configuration says how: by a webhook, by a command, or by both.
+rigcal sends notices of alarms if they are configured: by a webhook, by a command, or by both.
 
 ```toml
 [notify]
 webhook_url = "https://chat.example.com/hooks/SECRET"
 command = ["/usr/bin/msmtp", "someone@example.com"]
-least = "critical"   # alarms below it are not told; "warning" when left out
+least = "critical"   # least severity that is sent; default "warning"
 ```
 
-Each target is told when an alarm is raised, when it becomes critical and when it is over; an alarm that stands when
-`[notify]` is added, too. What happens within 3 s is one message. At most 20 messages an hour are sent; what comes
-beyond waits and is told in one. A delivery that fails is tried again after 10 s, then after twice as long each time, at
-most 15 min. Notices are rows of the store's table `notices` until they are delivered, so that a restart loses none; one
-that waits for more than 7 days is not sent by the next start. `rigcal alarms --send-test` sends a notice that is no
-alarm. Nothing is sent when a log is replayed. The address may hold a secret: the configuration should be readable by
-root and the service's group alone; log and status name the host only.
+Each target receives a notice when an alarm is raised, becomes critical or ends, and also for each alarm that is active
+when `[notify]` is added. Notices within 3 s are combined into one message. At most 20 messages an hour are sent;
+further notices wait and are sent in one message. A failed delivery is retried after 10 s, then with the delay doubled
+each time, up to 15 min. Notices are rows of the store's table `notices` until they are delivered, so a restart loses
+none. The next start does not send a notice that has waited for more than 7 days. `rigcal alarms --send-test` sends a
+test notice. Nothing is sent when a log is replayed. The address may contain a secret, so only root and the service's
+group should be able to read the configuration; log and status show only the host.
 
-The webhook gets a POST of a JSON object: `text` (all of it, as chat services show it), `subject`, `rig`, `host`,
-`notices` (`event` raised, cleared or test, `kind`, `subject`, `severity`, `text`, `remedy`, `raised_utc_ns`,
-`at_utc_ns`) and `unlisted`, how many older ones there are besides. A status of 2xx is a delivery, a redirection is not.
+The webhook receives a POST request with a JSON object: `text` (the whole message, as chat services show it),
+`subject`, `rig`, `host`, `notices` (`event` raised, cleared or test, `kind`, `subject`, `severity`, `text`, `remedy`,
+`raised_utc_ns`, `at_utc_ns`) and `unlisted`, the number of older notices that are not in the list. A status of 2xx
+means delivered; a redirection is a failure.
 
-The command is run without a shell, for at most 30 s, and gets an e-mail without recipients (RFC 5322) on its standard
-input. Exit status 0 is a delivery. The service's sandbox has no network until `network.conf` opens it to the address of
-the webhook or mail server ([installation](../../deploy/README.md#the-network)). The command runs in it too: programs
-that speak SMTP themselves, such as msmtp, work; those that hand over to a local mail system by a set-group-ID program
-(Postfix' sendmail) do not.
+The command is run without a shell, for at most 30 s, and receives an e-mail without recipients (RFC 5322) on its
+standard input. Exit status 0 means delivered. The service's sandbox has no network until `network.conf` opens it to the
+address of the webhook or mail server ([installation](../../deploy/README.md#the-network)). The command runs in the same
+sandbox. Programs that use SMTP themselves, such as msmtp, work; those that pass mail to a local mail system through a
+set-group-ID program (Postfix' sendmail) do not.
 
-This page is made from the code: `python -m docs.references`.
+This page is generated from the code: `python -m docs.references`.
 """
 
 

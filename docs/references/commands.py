@@ -1,4 +1,4 @@
-"""docs/reference/commands.md: every command with its arguments and options, made from the commands themselves."""
+"""docs/reference/commands.md: every command with its arguments and options, generated from the commands themselves."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from docs.references.markdown import table
 
 _HEAD = """# Commands
 
-Every command with its arguments and options. Each command says the same with `--help`.
-This page is made from the code: `python -m docs.references`.
+Every command with its arguments and options. `--help` of each command shows the same text.
+This page is generated from the code: `python -m docs.references`.
 
-Exit status of all commands: 0 done, 1 failed, 2 wrong use or bad input, 3 refused because the result would be unsafe
-to use; `rigcal health` alone has those of monitoring systems. With `--json`, standard output holds one JSON object and
-nothing else ([files and outputs](formats.md)). Where standard output is no terminal, what is printed has no colours and
-no moving parts.
+Exit status of all commands: 0 done, 1 failed, 2 wrong usage or bad input, 3 refused because the result would be unsafe
+to use. Only `rigcal health` differs: it has the exit statuses of monitoring plugins. With `--json`, standard output is
+one JSON object and nothing else ([files and outputs](formats.md)). Where standard output is not a terminal, the output
+has no colours and no animation.
 
-`rigcal completion bash | zsh | fish` prints the script by which a shell completes commands and options with the Tab
-key; the Debian package and `deploy/install.sh` put all three in place.
+`rigcal completion bash | zsh | fish` prints a script with which the shell completes commands and options on the Tab
+key; the Debian package and `deploy/install.sh` install all three scripts.
 """
 
 
@@ -56,7 +56,7 @@ def _parts(context: click.Context, command: click.Command) -> Iterator[str]:
 
 
 def _text(command: click.Command) -> str:
-    """Return a command's help, a paragraph a line."""
+    """Return a command's help with one line for each paragraph."""
     text = textwrap.dedent(command.help or "").replace("\b\n", "").strip()
     return "\n\n".join(_one_line(paragraph) for paragraph in text.split("\n\n"))
 

@@ -23,11 +23,12 @@ from drivers.stations.serial_port import SerialConfig
 
 _HEAD = """# Configuration
 
-Every key of the configuration, `/etc/rigcal/rigcal.toml` of the installed service. It is TOML; unknown keys are errors,
-and relative paths count from the file's own directory. `rigcal config check FILE` reads it without opening a device,
-`rigcal init` writes a first one, and [Connect bus and station](../how-to/connect.md) leads through it.
+Every key of the configuration file, which is `/etc/rigcal/rigcal.toml` for the installed service. The format is TOML.
+Unknown keys are errors, and relative paths are relative to the file's directory. `rigcal config check FILE` checks the
+file without opening a device, `rigcal init` writes an initial file, and [Connect bus and
+station](../how-to/connect.md) explains it step by step.
 
-This page is made from the code: `python -m docs.references`.
+This page is generated from the code: `python -m docs.references`.
 """
 _TABLES: tuple[tuple[str, type[BaseModel]], ...] = (
     ("The file", Config),

@@ -9,7 +9,8 @@ from docs.references.markdown import table
 
 _HEAD = """# Control socket
 
-The daemon listens at a Unix socket (`/run/rigcal/control.sock` as a service). One JSON object a line, each way:
+The daemon listens on a Unix socket (`/run/rigcal/control.sock` as a service). Each request and each answer is one JSON
+object on one line:
 
 ```json
 {"command": "session.start", "arguments": {"prism": "r"}}
@@ -17,18 +18,18 @@ The daemon listens at a Unix socket (`/run/rigcal/control.sock` as a service). O
 {"ok": false, "status": 2, "error": "one sentence"}
 ```
 
-`status` is the exit status that a command line ends with. A request holds at most 1 MiB, finite numbers, whole numbers
-of at most 64 bits, and 20 levels of lists and objects.
+`status` is the exit status with which the command line ends. A request has at most 1 MiB, finite numbers, integers of
+at most 64 bits, and 20 levels of lists and objects.
 
-A command that is given an argument it does not know, or not given one that it needs, is refused with status 2. What
-does not look only changes something, and takes `operator` as well: who is responsible. It is kept with sessions, guides
-and decisions on models, and stands in the log for every command.
+A command with an unknown argument, or without a required one, is refused with status 2. Every command that is not
+marked as *read-only* changes something, and also accepts `operator`, the name of the responsible person. The name is
+stored with sessions, guides and decisions on models, and is logged for every command.
 
-Commands that only look are also served at `status.sock` beside the control socket, for members of `read_group`. What
-the `guide.*` commands answer is in [Guides on the socket](guide-socket.md), with those of a simulated rig that is moved
-by hand.
+Read-only commands are also served on `status.sock`, in the same directory as the control socket, for members of
+`read_group`. [Guides on the socket](guide-socket.md) describes the answers of the `guide.*` commands and those of a
+simulated rig that is moved by hand.
 
-This page is made from the code: `python -m docs.references`.
+This page is generated from the code: `python -m docs.references`.
 """
 
 
@@ -43,8 +44,8 @@ def page() -> str:
 def _section(name: str, command: Command) -> Iterator[str]:
     """Yield the lines of a command's section."""
     does = f"{command.does[:1].upper()}{command.does[1:]}."
-    yield from (f"## {name}", "", does if command.changes else f"{does} *Only looks.*", "")
-    rows = [(f"`{key}`", "needed", meaning) for key, meaning in command.needed.items()]
+    yield from (f"## {name}", "", does if command.changes else f"{does} *Read-only.*", "")
+    rows = [(f"`{key}`", "required", meaning) for key, meaning in command.needed.items()]
     rows += [(f"`{key}`", "", meaning) for key, meaning in command.optional.items()]
     if rows:
         yield from (*table(("argument", "", "meaning"), rows), "")

@@ -12,18 +12,18 @@ from docs.references.markdown import table
 _HEAD = """# Effects
 
 Known physical causes of errors that `rigcal gap` can name, and that `calibrate --effects FAMILY@WHERE` adds.
-*Plausible* is the standard deviation that a coefficient is expected to have; beyond its bounds it is no evidence for
-the effect. `rigcal effects NAME --rig RIG` shows places and sizes for a rig of yours. [The gap between model and
-machine](../explanation/gap.md#the-library) says how one of them is chosen, [Extend rigcal](../how-to/extend.md) how to
-add one.
+*Plausible* is the expected standard deviation of a coefficient; a value beyond the bounds is no evidence for the
+effect. `rigcal effects NAME --rig RIG` shows places and sizes for your rig. [The gap between model and
+machine](../explanation/gap.md#the-library) explains how an effect is selected, and [Extend
+rigcal](../how-to/extend.md) how to add one.
 
-This page is made from the code: `python -m docs.references`.
+This page is generated from the code: `python -m docs.references`.
 """
 
 
 def page() -> str:
     """Return the text of docs/reference/effects.md."""
-    index = table(("effect", "acts at", "in a word"), (_line(family) for family in library().values()))
+    index = table(("effect", "acts at", "summary"), (_line(family) for family in library().values()))
     sections = (line for family in library().values() for line in _section(family))
     return "\n".join((_HEAD, *index, "", *sections)).rstrip() + "\n"
 
@@ -40,13 +40,13 @@ def _acts_at(family: Family) -> str:
 
 
 def _section(family: Family) -> Iterator[str]:
-    """Yield what a family says of itself."""
+    """Yield the section of a family, from its docstring and attributes."""
     yield from (f"## {family.name}", "", *(f"{text}\n" for text in _sentences(family)))
     places = family.places(shipped_rig("swdt82"))
     facts = {
         "equation": f"`{family.equation}`",
         "source": family.source,
-        "looks like": ", ".join(f"[`{name}`](#{name})" for name in family.confused_with) or "nothing else",
+        "can be confused with": ", ".join(f"[`{name}`](#{name})" for name in family.confused_with) or "nothing",
         "revealed by": family.revealed_by,
         "needs": _needs(family, places),
         "places in `swdt82`": ", ".join(f"`{place}`" for place in places) or "none",
@@ -63,7 +63,7 @@ def _section(family: Family) -> Iterator[str]:
 
 
 def _needs(family: Family, places: tuple[str, ...]) -> str:
-    """Return what a family needs beside the readings of the joints, of any joint where it acts at joints."""
+    """Return the inputs of a family in addition to joint readings; a joint's name is replaced by `<joint>`."""
     if not places:
         return ""
     needs = family.needs(places[0])

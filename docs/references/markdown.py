@@ -11,5 +11,5 @@ def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> Iterator[str]
 
 
 def _row(cells: Sequence[str]) -> str:
-    """Return a line of a table, with the cells' own bars escaped."""
+    """Return a line of a table, with vertical bars in cells escaped."""
     return "| " + " | ".join(cell.replace("|", r"\|") for cell in cells) + " |"

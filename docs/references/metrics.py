@@ -1,4 +1,4 @@
-"""docs/reference/metrics.md: every family of metrics."""
+"""docs/reference/metrics.md: every metric family."""
 
 from __future__ import annotations
 
@@ -8,20 +8,20 @@ from docs.references.markdown import table
 _HEAD = """# Metrics
 
 rigcal serves its state in [Prometheus' text format](https://prometheus.io/docs/instrumenting/exposition_formats/)
-where the configuration has
+if the configuration contains
 
 ```toml
 [metrics]
 port = 9750
 ```
 
-at `http://127.0.0.1:9750/metrics`. It listens on the loopback interface alone: a collector on the rig's computer
-(Prometheus itself, its agent mode, Grafana Alloy, Telegraf) reads it and takes it further. The service has no network
-until `network.conf` opens it ([installation](../../deploy/README.md#the-network)). Counters count since the
-daemon's start. All of it is in `rigcal status --json` too; besides stand the `process_` metrics of the official Python
-client (memory, descriptors, CPU time).
+The address is `http://127.0.0.1:9750/metrics`. rigcal listens only on the loopback interface: a collector on the rig's
+computer (Prometheus itself, its agent mode, Grafana Alloy, Telegraf) reads the metrics and forwards them. The service
+has no network until `network.conf` opens it ([installation](../../deploy/README.md#the-network)). Counters start at the
+daemon's start. `rigcal status --json` contains the same data. The `process_` metrics of the official Python client
+(memory, descriptors, CPU time) are served as well.
 
-An example of a scrape configuration and of a rule:
+Examples of a scrape configuration and of an alerting rule:
 
 ```yaml
 scrape_configs:
@@ -34,11 +34,11 @@ scrape_configs:
   expr: rigcal_alarms{severity="critical"} > 0 or rigcal_alarms_looked_age_seconds > 30 or up{job="rigcal"} == 0
 ```
 
-A monitoring system that runs commands asks `rigcal health`: one line a finding with what to do, and the exit status of
-the Nagios plugin interface (0 good, 1 warning, 2 critical, 3 the daemon cannot be asked). A member of `read_group` may
-run it.
+A monitoring system that runs commands can use `rigcal health`. It prints one line for each finding, with what to do,
+and has the exit status of the Nagios plugin interface (0 good, 1 warning, 2 critical, 3 the daemon does not answer).
+Members of `read_group` may run it.
 
-This page is made from the code: `python -m docs.references`.
+This page is generated from the code: `python -m docs.references`.
 """
 
 

@@ -14,12 +14,12 @@ import rigcal
 _HEAD = """# Python
 
 Every public name of `import rigcal`. [Notebook or program](../how-to/notebook.md) is a worked example. These names
-follow Semantic Versioning; everything below them in the other packages may change. `rigcal.__version__` is a string.
+follow Semantic Versioning; everything in the other packages may change. `rigcal.__version__` is a string.
 
-This page is made from the code: `python -m docs.references`.
+This page is generated from the code: `python -m docs.references`.
 """
 _QUOTED = re.compile(r"(?<=: )'(.*?)'(?= = |$)")
-"""An annotation that is kept as text."""
+"""An annotation that is stored as a string."""
 _PART = re.compile(r"(?m)^(Args|Attributes|Returns|Raises):\n")
 _ENTRY = re.compile(r"(?m)^    ([\w*, ]+): ")
 
@@ -32,7 +32,7 @@ def page() -> str:
 
 
 def _section(name: str) -> Iterator[str]:
-    """Yield what is to be said of a function or class."""
+    """Yield the section of a function or class."""
     thing = getattr(rigcal, name)
     yield from (f"## {name}", "")
     if not inspect.isclass(thing):
@@ -59,7 +59,7 @@ def _members(cls: type) -> Iterator[tuple[str, Any]]:
 
 
 def _signature(name: str, function: Any) -> Iterator[str]:
-    """Yield a call with its types, one argument a line where it is long."""
+    """Yield a signature with types; a long one has one argument on each line."""
     signature = inspect.signature(function)
     arguments = [p for p in signature.parameters.values() if p.name not in ("self", "cls")]
     plain = [_QUOTED.sub(r"\1", str(p)) for p in arguments]
@@ -75,7 +75,7 @@ def _signature(name: str, function: Any) -> Iterator[str]:
 
 
 def _text(thing: Any) -> Iterator[str]:
-    """Yield a docstring, its sections as lists."""
+    """Yield a docstring with its sections as lists."""
     text = inspect.getdoc(thing) or ""
     about, *sections = _PART.split(text)
     yield from (about.strip(), "")

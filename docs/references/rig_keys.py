@@ -30,26 +30,26 @@ from docs.references.markdown import table
 
 _HEAD = """# Columns and rig keys
 
-Every column of observations and every key of a rig file. What they are for is in [files and outputs](formats.md) and
+Every column of observations and every key of a rig file. Their use is described in [files and outputs](formats.md) and
 [rig files](../how-to/rig-files.md).
 
-This page is made from the code: `python -m docs.references`.
+This page is generated from the code: `python -m docs.references`.
 
 ## Columns of observations
 
-`<joint>` is the name of a joint in the rig file, `<signal>` that of a channel or a signal, or any other name. A column
-of numbers that is none of these is not used, and a warning says what to write to use it.
+`<joint>` is the name of a joint in the rig file, and `<signal>` the name of a channel or a signal, or any other name.
+Any other column of numbers is not used, and a warning explains how to make it usable.
 """
 _WRITTEN = """
 ## Columns that rigcal adds
 
-`rigcal predict` adds predictions (those of intervals with `--intervals`), `rigcal inverse` the closure, and a plan has
-`fixes`. In data that are read they are passed over.
+`rigcal predict` adds predictions (and intervals with `--intervals`), `rigcal inverse` adds the closure, and a plan has
+`fixes`. These columns are ignored in input data.
 """
 _KEYS = """
 ## Keys of a rig file
 
-A *name* begins with a letter and has letters, digits and underscores.
+A *name* begins with a letter and consists of letters, digits and underscores.
 """
 _TABLES: tuple[tuple[str, type[BaseModel]], ...] = (
     ("The file", Rig),
@@ -70,7 +70,7 @@ _TABLES: tuple[tuple[str, type[BaseModel]], ...] = (
     ('`device = "raw"`', RawSignal),
 )
 _ENDINGS = ("mm", "m", "deg", "kg", "s", "ms", "nm", "arcsec", "ppm", "counts", "bits", "hz")
-_UNITS = {  # of keys whose names do not end with it; most go with the kind of the joint
+_UNITS = {  # units of keys whose names do not end with the unit; most depend on the kind of the joint
     "limits": "deg or mm",
     "sigma": "deg or mm",
     "resolution": "deg or mm",
@@ -95,18 +95,18 @@ def _columns(columns: Iterable[Column], *, needed: bool) -> Iterator[str]:
 
 
 def _keys(title: str, model: type[BaseModel]) -> Iterator[str]:
-    """Yield the section of a table: the keys that a model has itself, what it inherits stands elsewhere."""
+    """Yield the section of a TOML table: the keys of the model itself; inherited keys have sections of their own."""
     yield f"### {title}"
     yield ""
     yield from keys(model, _own_fields(model))
 
 
 def keys(model: type[BaseModel], fields: Mapping[str, FieldInfo]) -> Iterator[str]:
-    """Yield the lines that describe some keys of a TOML table: the model's first paragraph, and a row for each key.
+    """Yield lines that describe keys of a TOML table: the model's first paragraph, and a row for each key.
 
     Args:
         model: its docstring and those of its bases describe each key under `Attributes:`.
-        fields: name -> key, those to list.
+        fields: name -> field of each key to list.
     """
     yield " ".join(str(model.__doc__).split("\n\n")[0].split())
     yield ""
@@ -120,7 +120,7 @@ def keys(model: type[BaseModel], fields: Mapping[str, FieldInfo]) -> Iterator[st
 
 
 def _own_fields(model: type[BaseModel]) -> Mapping[str, FieldInfo]:
-    """Return the fields of a model, but those that other sections have."""
+    """Return the fields of a model without those that have sections of their own."""
     elsewhere = next((base for base in model.__mro__[1:] if base in (AnyChannel, CanopenChannel)), None)
     if elsewhere is None:
         return model.model_fields
@@ -128,7 +128,7 @@ def _own_fields(model: type[BaseModel]) -> Mapping[str, FieldInfo]:
 
 
 def _told(model: type[BaseModel]) -> dict[str, str]:
-    """Return what the docstrings of a model and of those that it inherits from say of each attribute."""
+    """Return attribute -> description, from the docstrings of a model and its base classes."""
     found: dict[str, str] = {}
     for base in reversed(model.__mro__):
         names: list[str] = []
@@ -147,7 +147,7 @@ def _type(field: FieldInfo) -> str:
     above = next((rule.gt for rule in field.metadata if isinstance(rule, Gt)), None)
     least = next((rule.ge for rule in field.metadata if isinstance(rule, Ge)), None)
     most = next((rule.le for rule in field.metadata if isinstance(rule, Le)), None)
-    if any(getattr(rule, "pattern", None) for rule in field.metadata):  # the one pattern that there is
+    if any(getattr(rule, "pattern", None) for rule in field.metadata):  # the only pattern in use
         return "name"
     if above is not None:
         return f"{text} above {above}" if most is None else f"{text} above {above}, at most {most}"
@@ -157,7 +157,7 @@ def _type(field: FieldInfo) -> str:
 
 
 def _words(annotation: Any) -> str:
-    """Return an annotation as TOML has it, in words."""
+    """Return the TOML type of an annotation in words."""
     origin, arguments = get_origin(annotation), get_args(annotation)
     if origin in (Union, UnionType):
         return " or ".join(dict.fromkeys(_words(a) for a in arguments if a is not NoneType))

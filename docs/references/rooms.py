@@ -1,4 +1,4 @@
-"""The picture of the rooms: packages and their floors, from the import contracts in pyproject.toml."""
+"""A picture of the packages and their layers of rooms (folders), from the import contracts in pyproject.toml."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _STYLE = (
 
 
 def picture() -> str:
-    """Return the picture as SVG text, the same for the same contracts."""
+    """Return the picture as SVG text; equal contracts give equal text."""
     floors = _floors()
     columns = {name: [_wrapped(rooms) for rooms in floors[name]] for name in _SHOWN}
     bottom = max(_TOP + _HEAD + sum(_height(lines) + _FLOOR for lines in column) for column in columns.values()) + _EDGE
@@ -35,14 +35,14 @@ def picture() -> str:
     parts = [
         f'<rect class="package" x="{_EDGE}" y="{_EDGE}" width="{width - 2 * _EDGE}" height="44" rx="6"/>',
         _text(2 * _EDGE, _EDGE + 27, "rigcal", "head"),
-        _text(2 * _EDGE + 60, _EDGE + 27, "the public face: what `import rigcal` gives", "sub"),
+        _text(2 * _EDGE + 60, _EDGE + 27, "the public interface: `import rigcal`", "sub"),
     ]
     for number, (name, column) in enumerate(columns.items()):
         parts += _package(name, column, _EDGE + number * (_COLUMN + _EDGE), bottom - _EDGE)
     return "\n".join(
         (
             f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {bottom}">',
-            "<title>Packages and rooms: imports go down in a package, and from left to right between packages</title>",
+            "<title>Packages and rooms: imports go down in a package, and left to right between packages</title>",
             "<defs><marker id='tip' markerWidth='8' markerHeight='8' refX='6' refY='4' orient='auto'>"
             "<path d='M1,1 L7,4 L1,7 z' fill='#52606d'/></marker>"
             f"<style>{_STYLE}</style></defs>",
@@ -68,7 +68,7 @@ def _package(name: str, floors: Sequence[Sequence[str]], x: float, bottom: float
 
 
 def _floors() -> Mapping[str, Sequence[Sequence[str]]]:
-    """Return package -> its floors from the top, each with its rooms, as the contracts have them."""
+    """Return package -> its layers in the contracts, from the top, each with its rooms."""
     contracts: Sequence[Mapping[str, Any]] = tomllib.loads(_PROJECT.read_text("utf-8"))["tool"]["importlinter"][
         "contracts"
     ]
@@ -80,7 +80,7 @@ def _floors() -> Mapping[str, Sequence[Sequence[str]]]:
 
 
 def _wrapped(rooms: Sequence[str]) -> list[str]:
-    """Return rooms in lines that fit a column."""
+    """Return the names of rooms, wrapped to the width of a column."""
     lines: list[str] = []
     for room in rooms:
         longer = f"{lines[-1]}, {room}" if lines else room

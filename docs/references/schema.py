@@ -15,16 +15,16 @@ from docs.references.markdown import table
 
 _HEAD = """# The store's tables
 
-Every view, table and column of `rigcal.sqlite`. Read views first: they have ISO times, joints as columns, and units in
-their names. The views here are those of the rig `swdt82`; with another rig its own joints and signals are columns.
-[The store](../how-to/store.md#reading-it-with-other-tools) says how to open a store with other tools.
+Every view, table and column of `rigcal.sqlite`. Start with the views: they have ISO times, joints as columns, and units
+in their names. The views shown here are those of the rig `swdt82`; the columns of another rig are its own joints and
+signals. [The store](../how-to/store.md#reading-it-with-other-tools) explains how to open a store with other tools.
 
-This page is made from the code: `python -m docs.references`.
+This page is generated from the code: `python -m docs.references`.
 """
 
 
 def example() -> StoreDescription:
-    """Describe the store of the example rig, which the documentation shows."""
+    """Describe the store of the example rig that the documentation uses."""
     rig = shipped_rig("swdt82")
     joints = {joint.name: joint.unit for joint in rig.joints}
     signals = {channel.name: channel.unit for channel in rig.channels if channel.name not in joints}
@@ -45,7 +45,7 @@ def page() -> str:
             if told.is_view == are_views:
                 lines += _table_lines(told)
     lines.append("## Queries\n")
-    lines.append("The queries that `metadata.yaml` gives to Datasette. `:session` stands for a session's name.\n")
+    lines.append("The queries that `metadata.yaml` defines for Datasette. `:session` is the name of a session.\n")
     for query in store.queries:
         lines += [f"### {query.name}\n", f"{query.title}. {query.description}\n", f"```sql\n{query.sql}\n```\n"]
     return "\n".join(lines).rstrip() + "\n"
