@@ -13,7 +13,7 @@ import sqlite3
 import threading
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import TypeVar
 
@@ -169,8 +169,13 @@ class Acquisition:
     def status(self) -> AcquisitionStatus:
         """Return a snapshot; may be called from any thread."""
         summaries = self._decoding.summaries(self._clock.now())
-        state = self._board.snapshot(self._intakes, summaries, self._decoding.defects(), is_behind=self.is_behind)
-        return replace(state, is_write_hung=self._writer is not None and not self.alive(WRITE_HUNG_S))
+        return self._board.snapshot(
+            self._intakes,
+            summaries,
+            self._decoding.defects(),
+            is_behind=self.is_behind,
+            is_write_hung=self._writer is not None and not self.alive(WRITE_HUNG_S),
+        )
 
     @property
     def is_behind(self) -> bool:

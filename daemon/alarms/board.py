@@ -18,6 +18,7 @@ from daemon.alarms.alarm import Alarm, Rule
 from daemon.alarms.evidence import Evidence
 from daemon.alarms.library import library
 from daemon.host.safe_output import duration
+from daemon.host.worker_thread import WorkerThread
 from daemon.monitoring.notice import Notice, Severity
 from daemon.store.errors import StoreError
 from daemon.store.queries.alarms import AlarmTable
@@ -64,7 +65,7 @@ def _notice(event: Literal["raised", "cleared"], active: _Active, at: Stamp) -> 
     return Notice(event, **vars(active.alarm), raised=active.raised, at=at)
 
 
-class AlarmBoard:
+class AlarmBoard(WorkerThread):
     """Keeps the alarms. One thread calls `evaluate` once a second; any thread may call the other methods.
 
     Args:
@@ -84,6 +85,7 @@ class AlarmBoard:
         *,
         tell: Callable[[Notice], None] = _nobody,
     ) -> None:
+        super().__init__("alarms", STOP_S)
         self._tell = tell
         self._table, self._gather, self._clock = table, gather, clock
         self._rules = library() if rules is None else rules
@@ -93,20 +95,14 @@ class AlarmBoard:
         self._sighted: dict[tuple[str, str], Stamp] = {}  # when each present fault was first found
         self._unwritten: deque[_Active] = deque(maxlen=UNWRITTEN_MAX)  # cleared ones
         self._failed_rules: dict[str, str] = {}
-        self._told = ""  # the error of this board that was logged last
-        self._to_write, self._stopping = threading.Event(), False
-        self._writer = threading.Thread(target=self._run, name="alarms", daemon=True)
-
-    def start(self) -> None:
-        """Start the thread that writes alarms to the store; a disk may not answer for a long time."""
-        self._writer.start()
+        self._told: dict[str, str] = {}  # what failed -> the error that was logged last
+        self._to_write = threading.Event()
 
     def stop(self) -> None:
-        """Write pending alarms and end the thread. Does nothing if it was not started."""
-        self._stopping = True
+        """Write pending alarms and end the thread."""
+        self._stopping.set()
         self._to_write.set()
-        if self._writer.is_alive():
-            self._writer.join(STOP_S)
+        super().stop()
 
     def evaluate(self) -> None:
         """Apply all rules to the present evidence; never raises and never waits for the disk."""
@@ -118,10 +114,8 @@ class AlarmBoard:
                 self._clear(found, evidence.now)
                 self._looked = evidence.now
             self._to_write.set()
-        except Exception as error:
-            if str(error) != self._told:
-                log.exception("the alarms could not be evaluated")
-            self._told = str(error)
+        except Exception as error:  # noqa: BLE001 - logged; alarms must go on
+            self._log_once("the alarms could not be evaluated", error)
 
     def status(self) -> dict[str, Any]:
         """Return the active alarms, critical ones first and then the oldest first, and the age of the last evaluation.
@@ -204,10 +198,18 @@ class AlarmBoard:
                 log.info("alarm %s, %s is over after %s", active.alarm.kind, active.alarm.subject, lasted)
 
     def _run(self) -> None:
-        while not self._stopping:
+        while not self._stopping.is_set():
             self._to_write.wait()
             self._to_write.clear()
-            self.write()
+            try:
+                self.write()
+            except Exception as error:  # noqa: BLE001 - logged; a fault must not end the writing of alarms
+                self._log_once("the alarms could not be written", error)
+
+    def _log_once(self, what: str, error: Exception) -> None:
+        if str(error) != self._told.get(what):
+            log.error("%s", what, exc_info=error)
+        self._told[what] = str(error)
 
     def write(self) -> None:
         """Write all changes to the store; what cannot be written now is retried after the next evaluation."""

@@ -12,6 +12,7 @@ import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 import click
@@ -140,6 +141,12 @@ def _end_badly(error: Exception, *, as_json: bool) -> NoReturn:
 def json_option(function: Callable[..., Any]) -> Callable[..., Any]:
     """Add the `--json` option; a `Command` then prints what its function returns."""
     return click.option("--json", "as_json", is_flag=True, help="Print one JSON object and nothing else.")(function)
+
+
+def out_file_option(metavar: str, help_text: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Return the required option `--out` of commands that write one file."""
+    path = click.Path(dir_okay=False, path_type=Path)
+    return click.option("--out", type=path, required=True, metavar=metavar, help=help_text)
 
 
 def print_json(result: Mapping[str, Any]) -> None:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from calibration.errors import ModelError, UnsafeError
 from calibration.rig.description import Rig
+from daemon.host.worker_thread import WorkerThread
 from daemon.store.queries.models import ModelRow, ModelTable
 from daemon.store.queries.time_axis import TimeAxis
 
@@ -77,7 +78,7 @@ class LiveModelHealth:
     drifted_with: str | None = None
 
 
-class LiveModel:
+class LiveModel(WorkerThread):
     """Keeps the live model in memory; reading it never blocks.
 
     Args:
@@ -86,25 +87,19 @@ class LiveModel:
     """
 
     def __init__(self, table: ModelTable, rig: Rig) -> None:
+        super().__init__("live-model", STOP_TIMEOUT_S)
         self._table, self._rig = table, rig
         self._state: Loaded | Missing = Missing(LOADING)
         self._turn = threading.Lock()  # guards the state together with the mark that it is out of date
         self._changed = threading.Event()
         self._changed.set()
-        self._stopping = False
         self._told = ""  # the last load error that was logged
-        self._thread = threading.Thread(target=self._run, name="live-model", daemon=True)
-
-    def start(self) -> None:
-        """Start to load the live model."""
-        self._thread.start()
 
     def stop(self) -> None:
         """Stop loading; wait at most `STOP_TIMEOUT_S` for a load in progress."""
-        self._stopping = True
+        self._stopping.set()
         self._changed.set()
-        if self._thread.is_alive():
-            self._thread.join(timeout=STOP_TIMEOUT_S)
+        super().stop()
 
     def now(self) -> Loaded | Missing:
         """Return the live model, or the reason why there is none; from any thread."""
@@ -147,7 +142,7 @@ class LiveModel:
         while True:
             self._changed.wait(wait_s)
             self._changed.clear()
-            if self._stopping:
+            if self._stopping.is_set():
                 return
             state = self._look()
             wait_s = RETRY_S if isinstance(state, Missing) and state.is_defect else None
@@ -163,7 +158,7 @@ class LiveModel:
             jumped = tuple(name for name in self._table.jumped(row) if name in self._rig.joint_names)
             loaded = Loaded(row.id, self.load(row), jumped, self._table.time_axis())
         except Exception as error:  # noqa: BLE001 - logged, and shown as the state
-            if self._stopping:
+            if self._stopping.is_set():
                 return Missing(LOADING)  # store and processes are being stopped: not a defect of the model
             return self._failed(error)
         self._told = ""

@@ -172,6 +172,7 @@ class StatusBoard:
         defects: Mapping[str, Stamp] = MappingProxyType({}),
         *,
         is_behind: bool = False,
+        is_write_hung: bool = False,
     ) -> AcquisitionStatus:
         """Return the state of acquisition at this moment.
 
@@ -180,6 +181,7 @@ class StatusBoard:
             summaries: summaries of the CAN links.
             defects: link -> when its decoder last failed by an internal error.
             is_behind: as in `AcquisitionStatus`.
+            is_write_hung: as in `AcquisitionStatus`.
         """
         heard = {summary.link: summary for summary in summaries}
         now = self._clock.now()
@@ -209,6 +211,7 @@ class StatusBoard:
                 writer_lag_p99_s=lags[int(0.99 * (len(lags) - 1))] / NS_PER_S if lags else 0.0,
                 error=self._error,
                 is_behind=is_behind,
+                is_write_hung=is_write_hung,
             )
 
     @staticmethod

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from daemon.cli.command import Command, json_option
+from daemon.cli.command import Command, json_option, out_file_option
 from daemon.cli.offline import FILE
 from daemon.cli.terminal import counted, echo, echo_error, echo_list, echo_table
 from daemon.commands import CommandError
@@ -80,13 +80,7 @@ def rig_check(path: str, svg: Path | None, *, as_json: bool) -> dict[str, Any]:
     type=click.Choice(_CONVENTIONS),
     help="Convention of a table; by default as stated in the table, or else standard (dh).",
 )
-@click.option(
-    "--out",
-    type=click.Path(dir_okay=False, path_type=Path),
-    required=True,
-    metavar="RIG.toml",
-    help="Rig file to write; an existing file is never overwritten.",
-)
+@out_file_option("RIG.toml", "Rig file to write; an existing file is never overwritten.")
 @json_option
 def rig_import(
     path: Path, base: str | None, tips: tuple[str, ...], convention: Any, out: Path, *, as_json: bool
@@ -141,13 +135,7 @@ def rig_import(
 
 @rig.command("export", cls=Command)
 @click.argument("path", metavar="FILE")
-@click.option(
-    "--out",
-    type=click.Path(dir_okay=False, path_type=Path),
-    required=True,
-    metavar="OUT",
-    help="File to write; .urdf, .xacro, or .csv for a Denavit-Hartenberg table.",
-)
+@out_file_option("OUT", "File to write; .urdf, .xacro, or .csv for a Denavit-Hartenberg table.")
 @json_option
 def rig_export(path: str, out: Path, *, as_json: bool) -> dict[str, Any]:
     """Write a rig as URDF, xacro or Denavit-Hartenberg table.

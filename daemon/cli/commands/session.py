@@ -20,6 +20,7 @@ from daemon.sessions.export.table_formats import table_formats
 
 SHOT_TIMEOUT_S = 600.0
 _LOG_FORMATS = ("log", "candump", "asc", "blf")
+_TABLE_FORMATS = table_formats()
 
 
 @click.group()
@@ -152,10 +153,10 @@ def session_show(name: str, **where: Any) -> Any:
 @click.option(
     "--format",
     "form",
-    type=click.Choice([*_LOG_FORMATS, *table_formats()]),
+    type=click.Choice([*_LOG_FORMATS, *_TABLE_FORMATS]),
     default="log",
     show_default=True,
-    help=f"CAN logs of candump (log, candump) or Vector (asc, blf), or tables ({', '.join(table_formats())}).",
+    help=f"CAN logs of candump (log, candump) or Vector (asc, blf), or tables ({', '.join(_TABLE_FORMATS)}).",
 )
 @json_option
 def session_export(name: str, config: Path, out: Path, form: Any, *, as_json: bool) -> Any:
@@ -169,8 +170,8 @@ def session_export(name: str, config: Path, out: Path, form: Any, *, as_json: bo
     from daemon.sessions.export.tables import export_tables
 
     settings = read_config(config)
-    if form in table_formats():
-        files = export_tables(settings.store_path, name, out, table_formats()[form])
+    if form in _TABLE_FORMATS:
+        files = export_tables(settings.store_path, name, out, _TABLE_FORMATS[form])
     else:
         files = export_session(settings, name, out, "log" if form == "candump" else form)
     if not as_json:

@@ -9,7 +9,7 @@ from typing import Any
 import click
 
 from calibration.rig.columns import LEAST_SIGMA_MM
-from daemon.cli.command import Command, json_option
+from daemon.cli.command import Command, json_option, out_file_option
 from daemon.cli.offline import FILE, FiniteRange, rig_option, seed_option
 from daemon.cli.terminal import echo
 from daemon.host.safe_output import write_file
@@ -49,13 +49,7 @@ _MOST_POSES = 100_000
     metavar="K",
     help="Number of the recording; a different number measures the same machine in different poses, as held-out data.",
 )
-@click.option(
-    "--out",
-    type=click.Path(dir_okay=False, path_type=Path),
-    required=True,
-    metavar="CSV",
-    help="Observations CSV to write.",
-)
+@out_file_option("CSV", "Observations CSV to write.")
 @click.option(
     "--truth",
     "truth_out",

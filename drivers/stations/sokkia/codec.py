@@ -157,7 +157,6 @@ class SetParser:
         self._station = station
         self._codes: frozenset[int] = frozenset()
         self._has_sum: bool | None = None  # None: not known yet, or in doubt
-        self._is_warned = False
 
     def parse(self, data: bytes, first_byte: Stamp, last_byte: Stamp) -> Reply:
         if data.startswith(b"A "):  # answers the set-up command A
@@ -177,15 +176,13 @@ class SetParser:
     def _watch_sum(self, data: bytes, first_byte: Stamp) -> list[DeviceEvent]:
         """Return a warning at the first valid line without SUM, and its end at the first line with SUM again."""
         had_sum, self._has_sum = self._has_sum, carries_sum(data)
-        if self._has_sum and self._is_warned:
-            self._is_warned = False
+        if self._has_sum and had_sum is False:
             return [DeviceEvent(self._station, first_byte, EventKind.WARNING, SUM_AGAIN, _SUM_AGAIN_CODE)]
         if self._has_sum or had_sum is False:
             return []
         if had_sum:
             self._has_sum = None
             raise RecordError("the line has no SUM, but the previous lines had one")
-        self._is_warned = True
         return [DeviceEvent(self._station, first_byte, EventKind.WARNING, NO_SUM, _SUM_CODE)]
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import threading
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
@@ -82,6 +83,29 @@ def test_an_alarm_is_raised_once_and_cleared_once_in_store_log_and_status(
     ]
     (row,) = table(rig.path, "alarms")
     assert row["cleared_monotonic_ns"] - row["raised_monotonic_ns"] == 10_000_000_000
+
+
+def test_a_fault_while_alarms_are_written_does_not_end_their_writing(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    failed = threading.Event()
+
+    def fault(*_: object, **__: object) -> int:
+        failed.set()
+        raise ValueError("a fault of rigcal")
+
+    rig.wrong = {"boom": "no such port"}
+    rig.board.start()
+    with monkeypatch.context() as faulty:
+        faulty.setattr(AlarmTable, "add", fault)
+        for _ in range(4):
+            rig.clock.advance(1.0)
+            rig.board.evaluate()
+        assert failed.wait(10.0)
+    rig.board.evaluate()
+    rig.board.stop()
+    assert rig.stored() == [("boom", True)]
+    assert "the alarms could not be written" in caplog.text
 
 
 def test_an_alarm_that_becomes_critical_is_logged_as_such(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -66,7 +66,8 @@ def test_a_simulated_rig_that_has_died_is_told_instead_of_a_plug(tmp_path: Path)
         wait(lambda: "simulated_rig_ended" in run_apart("status", *where).stdout)
         status = run_apart("status", *where).stdout
         assert "plug, the adapter" not in status
-        assert "next      simulation: Stop the daemon, and start it again with a new simulated" in status
+        remedy = "next simulation: Stop the daemon, and start it again with a new simulated rig: `rigcal run --sim`."
+        assert remedy in " ".join(status.split())
         refused = run_apart("session", "start", "--prism", "r", *where)
         assert (
             "the simulated rig has ended; stop the daemon, and start both again with `rigcal run --sim`"

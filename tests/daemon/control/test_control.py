@@ -1,4 +1,5 @@
 import json
+import re
 import socket
 import threading
 from collections.abc import Iterator, Mapping
@@ -173,7 +174,7 @@ def test_json_that_no_command_can_use_is_one_refusal(path: Path, line: bytes) ->
     answer = talk(path, line)
     assert answer["ok"] is False
     assert answer["status"] == 2
-    assert "a request" in answer["error"]
+    assert re.match("a request|(whole numbers|texts) in a request must ", answer["error"])
     assert len(answer["error"]) < 200
     assert request(path, "echo", {"still": "here"}) == {"still": "here"}
 
