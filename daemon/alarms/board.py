@@ -198,9 +198,11 @@ class AlarmBoard(WorkerThread):
                 log.info("alarm %s, %s is over after %s", active.alarm.kind, active.alarm.subject, lasted)
 
     def _run(self) -> None:
-        while not self._stopping.is_set():
+        is_last = False
+        while not is_last:
             self._to_write.wait()
             self._to_write.clear()
+            is_last = self._stopping.is_set()  # asked before the write: what is pending at a stop is still written
             try:
                 self.write()
             except Exception as error:  # noqa: BLE001 - logged; a fault must not end the writing of alarms
