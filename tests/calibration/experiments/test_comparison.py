@@ -181,7 +181,7 @@ def test_the_paper_s_network_is_reported_with_its_best_width_beside(
 ) -> None:
     (note,) = drooping[-1].results[3].notes
     assert "theta = 0.05" in note
-    assert "at the best for each prism" in note
+    assert "at the best width of each prism" in note
 
 
 def test_without_a_residual_the_figures_are_those_of_the_effects(
@@ -201,9 +201,9 @@ def test_rows_and_poses_that_training_and_held_out_data_share_are_named() -> Non
     count, (same, pose) = shared_rows(data.select(np.arange(22)), data.select(np.arange(19, 40)), ("a.csv", "b.csv"))
     assert count == 3
     assert "3 of the 21 rows of b.csv are rows of a.csv" in same
-    assert "the first in line 21: " in same
+    assert "the first in line 21; " in same
     assert "2 of the 21 rows of b.csv were measured in poses of a.csv" in pose
-    assert "the first in line 24: " in pose
+    assert "the first in line 24; " in pose
     moved = replace(data, position_mm=data.position_mm + 0.1)
     count, found = shared_rows(data, moved, ("a.csv", "b.csv"))
     assert (count, len(found)) == (0, 1)

@@ -154,7 +154,7 @@ def test_copied_rows_count_once_and_are_named(session: Session) -> None:
     model = identify(session.rig, rig_text("swdt82"), copied)
     once = identify(session.rig, rig_text("swdt82"), training)
     assert any(
-        w.startswith("100 of 350 rows are exact copies of earlier rows") and "in line 252, " in w
+        w.startswith("100 of 350 rows are exact copies of earlier rows") and "in line 252; " in w
         for w in model.warnings
     )
     assert any(w.startswith("1 of 250 training fixes are outliers") and w.endswith("in line 9") for w in model.warnings)
