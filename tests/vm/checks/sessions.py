@@ -1,21 +1,26 @@
-"""A whole calibration, as operators do it."""
+"""A whole calibration, as operators do it, and a computer that is shut down while its jobs run."""
 
 from __future__ import annotations
+
+from typing import Any
 
 from tests.vm.image import OPERATOR
 from tests.vm.service import Service, expect
 
 TRAINING_POSES, CHECK_POSES = 14, 5
 SESSION_S, JOBS_S = 600.0, 3600.0
+LIST_UNITS = "systemctl list-units --plain --no-legend"
+SHUTDOWN = "like-shutdown.target"
 POLL_S = 5.0  # each question costs the machine
 
 
 def a_session_ends_in_an_accepted_model(service: Service) -> str:
-    """Set-up, control points, poses of the plan, stop; then the jobs, and an operator who accepts their model."""
+    """Set-up, control points, poses of the plan, stop; the jobs with a shutdown during the first; a model accepted."""
     service.on("cards")
     service.ask("setup.new", id="vm", instrument="simulated Topcon GTS-800A", tilt_arcsec=3.0, ppm=0.0)
     _hold(service, "static_poses", TRAINING_POSES)
     _hold(service, "check", CHECK_POSES)
+    _shut_down_during_a_job(service)
     before = service.link()
     began_s = service.machine.now_s()
     service.wait("the jobs", lambda: _have_ended(service), JOBS_S, POLL_S)
@@ -56,6 +61,27 @@ def _shoot(service: Service) -> None:
     service.machine.run("sleep 1.5")  # until the last fix of the prism has come
     service.ask("session.shoot", point="cp1")
     service.aim("tip")
+
+
+def _shut_down_during_a_job(service: Service) -> None:
+    """End the service, its jobs and their slice in one transaction, as systemd does when the computer is shut down.
+
+    The job is no attempt then, and is queued again by itself.
+    """
+
+    def running() -> dict[str, Any] | None:
+        return next((job for job in service.ask("jobs.list") if job["state"] == "running"), None)
+
+    machine = service.machine
+    job = service.wait("a job that runs", running, JOBS_S)
+    unit = service.wait("its unit", lambda: machine.run(f"{LIST_UNITS} 'rigcal-jobs@*.service'").partition(" ")[0])
+    ended = f"rigcal.service rigcal-jobs.socket system-rigcaljobs.slice {unit}"
+    machine.write(f"/run/systemd/system/{SHUTDOWN}", f"[Unit]\nConflicts={ended}\nAfter={ended}\n")
+    machine.run(f"systemctl daemon-reload && systemctl start {SHUTDOWN}", 120.0)
+    found = service.query(f"SELECT state, error, attempts FROM jobs WHERE id = {job['id']}")
+    expect(found == [["interrupted", "the daemon was stopped", 0]], f"{job}, then {found}")
+    machine.run(f"systemctl stop {SHUTDOWN}; systemctl start rigcal-jobs.socket rigcal", 900.0)
+    service.wait_until_well()
 
 
 def _have_ended(service: Service) -> bool:
