@@ -12,10 +12,12 @@ the packages `calibration`, `daemon`, `drivers` and `simulators` may change with
 """
 
 from calibration.design.planning import PosePlan
+from calibration.effects.fitted import FittedEffect
 from calibration.errors import CalibrationError, DataError, ModelError, RigError, UnsafeError
 from calibration.evaluation.evaluation import Evaluation
 from calibration.gap.result import GapResult
 from calibration.model.inverse import Inverse
+from calibration.model.model import ParameterEstimate
 from calibration.model.prediction import Prediction
 from calibration.observations import Observations
 from calibration.rig.description import Rig
@@ -30,11 +32,13 @@ __all__ = [
     "CalibrationError",
     "DataError",
     "Evaluation",
+    "FittedEffect",
     "GapResult",
     "Inverse",
     "Model",
     "ModelError",
     "Observations",
+    "ParameterEstimate",
     "PosePlan",
     "Prediction",
     "Rig",

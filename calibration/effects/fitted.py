@@ -54,10 +54,6 @@ class FittedEffect:
             "regime": None if self.regime is None else self.regime.as_dict(),
         }
 
-    def at_new_setups(self, context: EffectContext) -> FittedEffect:
-        """Return the effect for new set-ups, whose bases are fitted to the observations of a context."""
-        return replace(self, settings=library()[self.family].at_new_setups(context, self.where, self.settings))
-
     @property
     def form(self) -> str:
         """Phrase that describes variant and regime; empty for a plain effect."""

@@ -14,7 +14,7 @@ from calibration.effects.library import library, parse_effects
 from calibration.errors import DataError
 from calibration.gap.candidates import LEAST_KNOWN, candidate_at, variants_at
 from calibration.gap.joint_fit import JointFit, joint_fit, projected
-from calibration.gap.projection import Projection
+from calibration.gap.projected.projection import Projection
 from calibration.gap.screening import LOG_SCALE_ODDS, SCALES, Screen
 from calibration.identification.refinement import Fit, Prior
 from calibration.identification.solve import Solution

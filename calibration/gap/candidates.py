@@ -17,8 +17,8 @@ from calibration.effects.columns import EffectColumns, same_columns, sharing
 from calibration.effects.context import EffectContext
 from calibration.effects.fitted import Choice
 from calibration.effects.library import library
-from calibration.gap.projection import Projection
-from calibration.gap.rare_columns import without_zeros
+from calibration.gap.projected.projection import Projection
+from calibration.gap.projected.rare_columns import without_zeros
 from calibration.observations import Floats
 
 LEAST_KNOWN = 0.5  # smallest share of rows in which the inputs of an effect must be known

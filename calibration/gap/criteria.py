@@ -20,7 +20,7 @@ from calibration.effects.fitted import Choice
 from calibration.effects.library import library
 from calibration.gap.candidates import CandidateEffect
 from calibration.gap.formulas.grammar import Formula
-from calibration.gap.projection import Projection, SoftProjection, from_products, rows_of, without_folds
+from calibration.gap.projected.projection import Projection, SoftProjection, from_products, rows_of, without_folds
 from calibration.gap.screening import ScoredEffect, Screen
 from calibration.numerics.statistics import chance_of_mean
 from calibration.observations import Floats

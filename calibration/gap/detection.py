@@ -23,7 +23,7 @@ from scipy.special import log_ndtr
 
 from calibration.gap.formulas.grammar import Grammar
 from calibration.gap.formulas.terms import Kind
-from calibration.gap.projection import Integers, Projection
+from calibration.gap.projected.projection import Integers, Projection
 from calibration.gap.result import Disagreement
 from calibration.numerics.statistics import chance_beyond
 from calibration.observations import Floats

@@ -21,7 +21,7 @@ import numpy as np
 from calibration.effects.base import Coefficient, FittedCoefficient
 from calibration.effects.fitted import Choice
 from calibration.effects.library import library
-from calibration.gap.projection import Integers
+from calibration.gap.projected.projection import Integers
 from calibration.gap.result import Forecast
 from calibration.gap.screening import Screen
 from calibration.observations import Floats

@@ -10,7 +10,7 @@ import numpy as np
 from calibration.effects.columns import EffectColumns, joined, nearly_same
 from calibration.effects.context import EffectContext
 from calibration.effects.fitted import Choice, FittedEffect
-from calibration.gap.projection import Projection
+from calibration.gap.projected.projection import Projection
 from calibration.identification.refinement import Fit, Prior, refine
 from calibration.identification.solve import Solution
 from calibration.observations import Floats, Observations

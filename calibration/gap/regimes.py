@@ -21,7 +21,7 @@ from calibration.gap.candidates import CandidateEffect, candidate_at, each_candi
 from calibration.gap.detection import FAR, detect
 from calibration.gap.formulas.grammar import Grammar
 from calibration.gap.joint_fit import JointFit, Problem
-from calibration.gap.projection import Integers, Projection, SoftProjection, rows_of
+from calibration.gap.projected.projection import Integers, Projection, SoftProjection, rows_of
 from calibration.gap.screening import Screen
 from calibration.numerics.matrices import gram
 from calibration.observations import Floats

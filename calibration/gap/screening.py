@@ -23,8 +23,8 @@ from calibration.effects.context import EffectContext
 from calibration.effects.fitted import Choice, FittedEffect
 from calibration.effects.library import library
 from calibration.gap.candidates import CandidateEffect
-from calibration.gap.column_products import BlockProducts, ProjectedProducts
-from calibration.gap.projection import Projection, from_products
+from calibration.gap.projected.column_products import BlockProducts, ProjectedProducts
+from calibration.gap.projected.projection import Projection, from_products
 from calibration.observations import Floats
 
 _PAIRED = 10

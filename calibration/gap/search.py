@@ -25,7 +25,7 @@ from calibration.gap.background.search import background_log_bayes_factor
 from calibration.gap.detection import detect
 from calibration.gap.formulas.grammar import Formula, Grammar
 from calibration.gap.joint_fit import OUTLIER, Problem, joint_fit
-from calibration.gap.projection import follows_path
+from calibration.gap.projected.projection import follows_path
 from calibration.gap.regimes import effect_in_regime
 from calibration.gap.screening import by_family
 from calibration.gap.search_result import STRUCTURE, SearchResult

@@ -24,7 +24,7 @@ from calibration.gap.formulas.grammar import Formula, Grammar, describe
 from calibration.gap.formulas.terms import modulations
 from calibration.gap.formulas.variables import ErrorSource
 from calibration.gap.joint_fit import OUTLIER, JointFit, Problem
-from calibration.gap.projection import Projection
+from calibration.gap.projected.projection import Projection
 from calibration.gap.result import Break, Evidence
 from calibration.gap.screening import ScoredEffect, Screen
 from calibration.observations import Floats

@@ -37,9 +37,11 @@ class ParameterEstimate:
     """One identified constant.
 
     Attributes:
-        name, unit: as `kinematics.Parameter`; values are deviations from nominal, mm or rad.
-        kind: `row`, `prism` or `base`; a base's deviation is from the placement in the model.
-        value, standard_error: posterior mean and standard deviation.
+        name: for example `row4.theta`, `prism.r.y`, `base[s1].rx` (`base.rx` if the set-up has no name).
+        unit: `mm` or `rad`.
+        kind: `row`, `prism` or `base`.
+        value, standard_error: deviation from the nominal value, for a base from the placement in the model, and its
+            standard deviation.
         prior_sigma: tolerance used in the fit, infinity for none.
     """
 

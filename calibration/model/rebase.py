@@ -8,7 +8,8 @@ import numpy as np
 
 from calibration.effects.columns import EffectColumns
 from calibration.effects.context import EffectContext
-from calibration.effects.fitted import coefficient_values, fitted_columns
+from calibration.effects.fitted import FittedEffect, coefficient_values, fitted_columns
+from calibration.effects.library import library
 from calibration.identification.checks import refuse_turning
 from calibration.identification.linear_model import information
 from calibration.identification.refinement import Fit, refine
@@ -55,7 +56,7 @@ def with_refitted_base(model: CalibratedModel, observations: Observations) -> Ca
     chain = Chain(model.rig, start.placements)
     free = np.arange(len(chain)) >= body
     context = EffectContext(chain, extended(model.values), observations)
-    model = replace(model, effects=tuple(effect.at_new_setups(context) for effect in model.effects))
+    model = replace(model, effects=tuple(_at_new_setups(effect, context) for effect in model.effects))
     effect_columns = fitted_columns(model.effects, context)
     effect_columns = effect_columns.over(samples.average)
     moves = np.concatenate([free, np.zeros(len(effect_columns), dtype=bool)])
@@ -101,6 +102,12 @@ def with_refitted_base(model: CalibratedModel, observations: Observations) -> Ca
         nominal_values=nominal.x,
         intervals=model.intervals.at_other_setups(),
     )
+
+
+def _at_new_setups(effect: FittedEffect, context: EffectContext) -> FittedEffect:
+    """Return an effect for new set-ups, whose bases are fitted to the observations of a context."""
+    settings = library()[effect.family].at_new_setups(context, effect.where, effect.settings)
+    return replace(effect, settings=settings)
 
 
 def _why_left_out(without: CalibratedModel, whole: CalibratedModel, observations: Observations) -> str:

@@ -15,7 +15,7 @@ from threadpoolctl import threadpool_limits
 from calibration.effects.context import EffectContext
 from calibration.effects.library import library
 from calibration.gap.candidates import candidate_effects
-from calibration.gap.projection import Projection
+from calibration.gap.projected.projection import Projection
 from calibration.gap.screening import Screen
 from calibration.identification.solve import solve
 from calibration.observations import Observations, parse_observations

@@ -55,7 +55,16 @@ def test_no_code_of_the_page_is_left_out_by_doctest() -> None:
 def test_every_public_name_is_documented_and_there() -> None:
     for name in rigcal.__all__:
         assert getattr(rigcal, name).__doc__, name
-    results = {"Evaluation", "GapResult", "Inverse", "PosePlan", "Prediction", "Store"}
+    results = {
+        "Evaluation",
+        "GapResult",
+        "Inverse",
+        "PosePlan",
+        "Prediction",
+        "Store",
+        "FittedEffect",
+        "ParameterEstimate",
+    }
     errors = {"CalibrationError", "DataError", "ModelError", "RigError", "StoreError", "UnsafeError"}
     entries = {"Rig", "Observations", "Model", "calibrate", "find_gap", "plan", "open_store", "__version__"}
     assert set(rigcal.__all__) == entries | results | errors

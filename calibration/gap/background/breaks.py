@@ -14,7 +14,7 @@ import numpy as np
 from calibration.gap.background.blocks import drift_block, event_block, time_blocks
 from calibration.gap.background.search import ODDS, background_log_bayes_factor
 from calibration.gap.joint_fit import JointFit, Problem
-from calibration.gap.projection import Projection, from_products, rows_of
+from calibration.gap.projected.projection import Projection, from_products, rows_of
 from calibration.gap.regimes import borders
 from calibration.gap.result import Break
 from calibration.observations import ROW, Floats

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.special import fdtrc
 
 from calibration.gap.background.system import Chosen, Model, System
-from calibration.gap.projection import rows_of
+from calibration.gap.projected.projection import rows_of
 from calibration.observations import Floats
 
 

@@ -21,7 +21,7 @@ from calibration.gap.background.system import Model, System
 from calibration.gap.background.widening import PossibleBlocks
 from calibration.gap.candidates import candidate_at, variants_at
 from calibration.gap.joint_fit import OUTLIER, JointFit, Problem
-from calibration.gap.projection import Integers, Projection, rows_of
+from calibration.gap.projected.projection import Integers, Projection, rows_of
 from calibration.gap.result import Evidence
 from calibration.gap.screening import ScoredEffect, Screen
 from calibration.numerics.matrices import gram

@@ -14,7 +14,7 @@ from calibration.gap.candidates import CandidateEffect
 from calibration.gap.detection import detect
 from calibration.gap.formulas.grammar import Formula, Grammar
 from calibration.gap.joint_fit import JointFit, Problem, along
-from calibration.gap.projection import Projection
+from calibration.gap.projected.projection import Projection
 from calibration.identification.refinement import refine
 from calibration.observations import Floats
 

@@ -16,7 +16,7 @@ from calibration.effects.columns import EffectColumns
 from calibration.gap.background.blocks import Block
 from calibration.gap.background.evidence import Products, Scales, maximise_evidence, posterior_factor
 from calibration.gap.candidates import CandidateEffect
-from calibration.gap.projection import Projection
+from calibration.gap.projected.projection import Projection
 from calibration.gap.screening import ScoredEffect, Screen
 from calibration.observations import Floats
 

@@ -17,7 +17,7 @@ from calibration.effects.columns import joined
 from calibration.gap.background.blocks import Block
 from calibration.gap.background.evidence import posterior_factor
 from calibration.gap.background.system import Model, System
-from calibration.gap.projection import rows_of
+from calibration.gap.projected.projection import rows_of
 from calibration.observations import Floats
 
 PossibleBlocks = Callable[[], Iterator[Block]]

@@ -19,7 +19,7 @@ from scipy.special import logsumexp
 
 from calibration.gap.formulas.terms import Term, all_terms, chunks, columns_of
 from calibration.gap.formulas.variables import Variables
-from calibration.gap.projection import Projection, SoftProjection
+from calibration.gap.projected.projection import Projection, SoftProjection
 from calibration.observations import Floats
 
 _LEAST_SEEN = 1e-3  # smallest visible share of a term's displacement, relative to the largest; less is rounding

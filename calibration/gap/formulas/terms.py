@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 
 from calibration.gap.formulas.variables import ErrorSource, Variable, Variables
-from calibration.gap.projection import Projection
+from calibration.gap.projected.projection import Projection
 from calibration.observations import Floats
 
 Kind = Literal["single", "crossing", "product"]

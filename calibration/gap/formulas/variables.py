@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calibration.effects.boom import boom_in
-from calibration.gap.projection import Projection
+from calibration.gap.projected.projection import Projection
 from calibration.observations import Floats
 from calibration.rig.columns import own_columns
 from calibration.rig.description import Joint

@@ -12,7 +12,7 @@ from calibration.effects.columns import joined
 from calibration.effects.fitted import Choice
 from calibration.gap.candidates import CandidateEffect, candidate_at, variants_at
 from calibration.gap.joint_fit import OUTLIER, JointFit, Problem
-from calibration.gap.projection import Projection
+from calibration.gap.projected.projection import Projection
 from calibration.gap.screening import Screen
 
 _BETTER = 1.0  # log Bayes factor required to change the variant of an adopted effect

@@ -16,7 +16,7 @@ from calibration.gap.criteria import best_of_each_family, is_certain
 from calibration.gap.detection import detect
 from calibration.gap.formulas.grammar import Formula, Grammar
 from calibration.gap.joint_fit import OUTLIER, JointFit, Problem
-from calibration.gap.projection import Projection
+from calibration.gap.projected.projection import Projection
 from calibration.gap.regimes import EffectInRegime
 from calibration.gap.screening import ScoredEffect, Screen
 from calibration.gap.search_result import COMPARED, SearchResult, SelectionStep, closes_gap, conclude

@@ -31,7 +31,7 @@ from calibration.gap.formulas.grammar import Formula, Grammar
 from calibration.gap.formulas.terms import all_terms
 from calibration.gap.formulas.variables import Variables
 from calibration.gap.joint_fit import JointFit, Problem
-from calibration.gap.projection import Projection
+from calibration.gap.projected.projection import Projection
 from calibration.gap.screening import ScoredEffect, Screen, by_family
 
 _MOST_OF_A_SET = 3

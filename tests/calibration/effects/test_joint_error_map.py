@@ -18,7 +18,7 @@ from calibration.effects.library import library
 from calibration.evaluation.evaluation import evaluate
 from calibration.gap.candidates import candidate_at
 from calibration.gap.joint_fit import joint_fit
-from calibration.gap.projection import Projection
+from calibration.gap.projected.projection import Projection
 from calibration.gap.screening import Screen
 from calibration.identification.solve import Solution
 from calibration.kinematics.chain import Chain, Placement

@@ -20,7 +20,7 @@ from calibration.gap.detection import detect
 from calibration.gap.formulas.grammar import Grammar, describe
 from calibration.gap.formulas.terms import columns_of, modulations
 from calibration.gap.formulas.variables import ErrorSource, Variable
-from calibration.gap.projection import Projection, cells
+from calibration.gap.projected.projection import Projection, cells
 from calibration.gap.screening import Screen
 from calibration.gap.search_result import closes_gap
 from calibration.identification.identifiability import identifiability

@@ -24,7 +24,7 @@ from calibration.gap.candidates import candidate_at, candidate_effects
 from calibration.gap.criteria import with_same_family
 from calibration.gap.discrimination import POSES, propose_experiments
 from calibration.gap.forecast import forecasts
-from calibration.gap.projection import Projection, from_products
+from calibration.gap.projected.projection import Projection, from_products
 from calibration.gap.result import Experiment, Forecast
 from calibration.gap.screening import ScoredEffect, Screen
 from calibration.identification.identifiability import identifiability

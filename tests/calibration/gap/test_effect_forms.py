@@ -14,7 +14,7 @@ from calibration.effects.fitted import Choice
 from calibration.effects.library import library
 from calibration.gap.candidates import candidate_at, variants_at
 from calibration.gap.detection import neighbour_tests
-from calibration.gap.projection import Projection
+from calibration.gap.projected.projection import Projection
 from calibration.gap.screening import Screen
 from calibration.identification.identifiability import identifiability
 from calibration.identification.linear_model import prior_precision

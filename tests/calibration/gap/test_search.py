@@ -10,7 +10,7 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from calibration.effects.library import library
-from calibration.gap.projection import SoftProjection, from_products, without_folds
+from calibration.gap.projected.projection import SoftProjection, from_products, without_folds
 from calibration.gap.result import GapResult
 from calibration.identification.reading_steps import step_of
 from calibration.observations import parse_observations

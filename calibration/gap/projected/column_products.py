@@ -16,8 +16,8 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from calibration.effects.columns import EffectColumns, joined
-from calibration.gap.projection import Projection
-from calibration.gap.rare_columns import RareColumns
+from calibration.gap.projected.projection import Projection
+from calibration.gap.projected.rare_columns import RareColumns
 from calibration.observations import Floats
 
 _AT_ONCE = 64  # columns per batch

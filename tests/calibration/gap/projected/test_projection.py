@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calibration.gap.projection import SoftProjection
+from calibration.gap.projected.projection import SoftProjection
 from calibration.numerics.matrices import gram
 
 

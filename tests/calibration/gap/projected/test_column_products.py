@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from calibration.gap.candidates import CandidateEffect, candidate_at, candidate_effects, variants_at
-from calibration.gap.column_products import ProjectedProducts
-from calibration.gap.projection import Projection
+from calibration.gap.projected.column_products import ProjectedProducts
+from calibration.gap.projected.projection import Projection
 from calibration.gap.regimes import _Columns
 from calibration.gap.screening import SCALES, Screen
 from calibration.observations import parse_observations
