@@ -90,12 +90,15 @@ types: environment
 imports: environment
 	$(BIN)/lint-imports
 
-# Some of every room, and nothing that starts a daemon.
-QUICK := tests/drivers tests/daemon/store tests/daemon/report tests/daemon/alarms tests/daemon/config tests/daemon/cli/lines \
-	tests/calibration/numerics tests/calibration/rig tests/simulators/devices
+# Some of every room, and nothing that starts a daemon. Where memory can hold files, no test waits for the disk.
+QUICK := tests/drivers tests/daemon/store tests/daemon/alarms tests/daemon/config tests/daemon/cli/lines \
+	tests/daemon/jobs/test_scheduler.py tests/daemon/web/test_access.py tests/daemon/report/test_front.py \
+	tests/calibration/numerics tests/calibration/rig tests/calibration/identification/test_start.py \
+	tests/calibration/gap/projected tests/simulators/devices
+IN_MEMORY := $(if $(wildcard /dev/shm),--basetemp /dev/shm/rigcal-quick-$(shell id -u))
 
 quick: environment
-	$(BIN)/python -m pytest -q -n $(shell echo $$(($$(nproc) + 1))) --dist loadfile -m "not slow and not long" $(QUICK)
+	$(BIN)/python -m pytest -q -n $(shell echo $$(($$(nproc) + 1))) --dist loadfile -m "not slow and not long" $(IN_MEMORY) $(QUICK)
 
 check: ## lint and a quick part of the tests, in a minute: before each commit
 	@$(MAKE) --no-print-directory -j2 --output-sync=target types quick imports style

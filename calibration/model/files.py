@@ -56,7 +56,7 @@ Triple = tuple[Bounded, Bounded, Bounded]
 _DOCUMENT_MAX_BYTES = 8 << 20  # 300 joints, prisms and set-ups need a tenth of that
 
 # Errors, in addition to KeyError, that the parsers of JSON and TOML and the learners raise for hostile bytes.
-_UNREADABLE = (ArithmeticError, AttributeError, IndexError, MemoryError, RuntimeError, TypeError, ValueError, RigError)
+_UNREADABLE = (ArithmeticError, AttributeError, IndexError, RuntimeError, TypeError, ValueError, RigError)
 
 
 class _Part(BaseModel):
@@ -266,6 +266,7 @@ def model_from_files(files: Mapping[str, bytes]) -> CalibratedModel:
     Raises:
         ModelError: the model is truncated, edited or of an unsupported version, or the files are not a model. The
             message is one sentence.
+        MemoryError: this computer has too little memory.
     """
     checked = check_manifest(files)
     if len(checked.get("model.json", b"")) > _DOCUMENT_MAX_BYTES:

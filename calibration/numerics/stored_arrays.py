@@ -30,7 +30,7 @@ _HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0
 _ENDING = ".npy"
 # Errors, in addition to ValueError, that the standard library and numpy raise for hostile archives and headers.
 _DAMAGED = (
-    *(EOFError, IndexError, KeyError, MemoryError, OSError, OverflowError, RuntimeError, SyntaxError, TypeError),
+    *(EOFError, IndexError, KeyError, OSError, OverflowError, RuntimeError, SyntaxError, TypeError),
     *(struct.error, tokenize.TokenError, zipfile.BadZipFile),
 )
 
@@ -50,6 +50,7 @@ def read_npz(data: bytes) -> dict[str, NDArray[np.generic]]:
 
     Raises:
         ValueError: the data are not such an archive, or it has compressed members or pickled objects.
+        MemoryError: this computer has too little memory.
     """
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
@@ -72,7 +73,10 @@ def _array(data: bytes, name: str) -> NDArray[np.generic]:
     version = npy.read_magic(stream)
     if version not in _HEADERS:
         raise ValueError(f"{name} has the unsupported format version {version}")
-    shape, is_fortran, dtype = _HEADERS[version](stream)
+    try:
+        shape, is_fortran, dtype = _HEADERS[version](stream)
+    except MemoryError as error:  # Python's parser: the header, which is short, is nested too deeply
+        raise ValueError(f"the header of {name} is nested too deeply") from error
     body = data[stream.tell() :]
     if dtype.hasobject or dtype.itemsize == 0 or math.prod(shape) * dtype.itemsize != len(body):
         raise ValueError(f"{name} does not hold an array of {dtype} of shape {shape}")

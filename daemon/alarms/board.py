@@ -95,6 +95,7 @@ class AlarmBoard(WorkerThread):
         self._sighted: dict[tuple[str, str], Stamp] = {}  # when each present fault was first found
         self._unwritten: deque[_Active] = deque(maxlen=UNWRITTEN_MAX)  # cleared ones
         self._failed_rules: dict[str, str] = {}
+        self._paused_rules: set[str] = set()
         self._told: dict[str, str] = {}  # what failed -> the error that was logged last
         self._to_write = threading.Event()
 
@@ -151,9 +152,10 @@ class AlarmBoard(WorkerThread):
         return _Active(alarm, row["raised"], self._looked, GRACE_S, row["id"], alarm)
 
     def _found(self, evidence: Evidence) -> dict[tuple[str, str], tuple[Alarm, Rule]]:
-        """Apply the rules; a rule that fails is skipped and noted."""
+        """Apply the rules; note those that fail or are paused."""
         found: dict[tuple[str, str], tuple[Alarm, Rule]] = {}
         failed: dict[str, str] = {}
+        self._paused_rules = {rule.kind for rule in self._rules if rule.is_paused(evidence)}
         for rule in self._rules:
             try:
                 for alarm in rule(evidence):
@@ -187,7 +189,7 @@ class AlarmBoard(WorkerThread):
 
     def _clear(self, found: Mapping[tuple[str, str], object], now: Stamp) -> None:
         for key, active in list(self._active.items()):
-            if key in found or active.alarm.kind in self._failed_rules:
+            if key in found or active.alarm.kind in self._failed_rules or active.alarm.kind in self._paused_rules:
                 continue
             if now.since(active.seen) >= active.hold_s * NS_PER_S:
                 del self._active[key]

@@ -10,7 +10,7 @@ import threading
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from calibration.errors import ModelError, UnsafeError
+from calibration.errors import CalibrationError, ModelError, UnsafeError
 from calibration.rig.description import Rig
 from daemon.host.worker_thread import WorkerThread
 from daemon.store.queries.models import ModelRow, ModelTable
@@ -128,11 +128,15 @@ class LiveModel(WorkerThread):
         """Read a model of the store; a child process loaded it successfully when it was written.
 
         Raises:
-            CalibrationError: the model is damaged, edited, or made for a different rig file.
+            CalibrationError: the model is damaged, edited, or made for a different rig file; or this computer lacks
+                something that loading needs.
         """
         from daemon.warm_up import prepare
 
-        prepare()
+        try:
+            prepare()
+        except OSError as error:
+            raise CalibrationError(f"compiled code cannot be stored: {error}") from error
         from daemon.models.model_files import read_model_of_rig  # numerical packages take a second to import
 
         return read_model_of_rig(row.path, row.manifest_sha256, self._rig)

@@ -143,6 +143,13 @@ def read_model(directory: Path, manifest_sha256: str | None = None) -> Calibrate
         ModelError: not a model, truncated, edited, of a different version, or it crashes the process that loads it.
         CalibrationError: this computer lacks something that loading needs, or its disk fails.
     """
+    try:
+        return _read_model(directory, manifest_sha256)
+    except MemoryError as error:
+        raise CalibrationError(f"{directory}: this computer has too little memory to load the model") from error
+
+
+def _read_model(directory: Path, manifest_sha256: str | None) -> CalibratedModel:
     if not directory.is_dir():
         raise ModelError(f"{directory} is not a directory; name a model directory, as written by `rigcal calibrate`")
     if not (directory / MANIFEST).is_file():
@@ -197,7 +204,7 @@ def _listed(directory: Path) -> list[str]:
     """Return the file names in the manifest, whose other content is not checked."""
     try:
         names = list(json.loads(_read(directory, MANIFEST, _MANIFEST_MAX_BYTES) or b"")["files"])
-    except (ValueError, KeyError, TypeError, RecursionError, MemoryError) as error:
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise ModelError(f"{directory}: {MANIFEST} is damaged; restore the model, or remove it") from error
     if len(names) > _FILES_MAX:
         raise ModelError(f"{directory}: {MANIFEST} lists {len(names)} files; a model has at most {_FILES_MAX}")

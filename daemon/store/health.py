@@ -94,6 +94,7 @@ class StoreWatch:
         self._store, self._clock = store, clock
         self._findings: str | None = None  # result of the check; None until it has finished
         self._told = ""  # the error of the check that was logged last
+        self._size_bytes = 0  # of the database, at the last look
         self._stopping = threading.Event()
         self._connection: sqlite3.Connection | None = None
         self._check: threading.Thread | None = None
@@ -135,6 +136,7 @@ class StoreWatch:
         path = self._store.path
         try:
             changed = self._store.files.changed()
+            size_bytes = path.stat().st_size if changed is None else self._size_bytes
         except OSError as error:
             return "missing", f"{path}: cannot be accessed ({error.strerror}): check the disk; `dmesg` may show why"
         if changed is not None:
@@ -144,6 +146,9 @@ class StoreWatch:
                 f"{name}: the file that rigcal writes to {found}, and its data are lost when rigcal stops: move the "
                 f"file back if it was moved; otherwise save it first{self._copies()}, then restart rigcal"
             )
+        if size_bytes < self._size_bytes:
+            self._store.damage = self._store.damage or "the file has become smaller: another program has overwritten it"
+        self._size_bytes = size_bytes
         if damage := self._findings or self._store.damage:
             return "damaged", (
                 f"{path}: the store is damaged ({damage}); acquisition continues, but jobs do not run, and stored data "

@@ -22,6 +22,7 @@ from drivers.readings import DeviceEvent, Record
 
 _FILE_MAX_BYTES = 2 << 20
 _BLANKS = re.compile(r"[^\S\n]+")
+_COMMENT = re.compile(r"^\s*[#;].*|(?<=\s);.*")
 
 TPDO_COMMUNICATION = 0x1800
 TPDO_MAPPING = 0x1A00
@@ -231,10 +232,12 @@ def _import(path: Path, node: int) -> ObjectDictionary:
     try:
         # CiA 306 prescribes ASCII, but some manufacturers use Latin-1 in names
         text = io.StringIO(read_whole(path, _FILE_MAX_BYTES).decode("latin-1"), newline=None).read()
-        # Passed as text, because from a file named .epf canopen would read XML. Runs of blanks are shortened, because
-        # the time that configparser takes for one grows with the square of its length
-        file = io.StringIO(_BLANKS.sub(" ", text))
-        dictionary: ObjectDictionary = import_eds(file, node)  # type: ignore[no-untyped-call]
+        # The time that configparser takes for a run of blanks grows with the square of its length
+        text = _BLANKS.sub(" ", text)
+        if (number := _first_bad_line(text)) is not None:
+            raise DescriptionError(str(path), f"not a valid EDS: line {number} is neither [section] nor name=value")
+        # As text, because from a file named .epf canopen would read XML
+        dictionary: ObjectDictionary = import_eds(io.StringIO(text), node)  # type: ignore[no-untyped-call]
         return dictionary
     except OSError as error:
         raise DescriptionError(str(path), f"cannot be read: {error.strerror}") from error
@@ -243,6 +246,31 @@ def _import(path: Path, node: int) -> ObjectDictionary:
     # Exceptions that canopen lets escape when it parses numbers, sections and sub-objects
     except (ValueError, KeyError, TypeError, AttributeError, IndexError, ObjectDictionaryError) as error:
         raise DescriptionError(str(path), f"not a valid EDS: {error}") from error
+
+
+def _first_bad_line(text: str) -> int | None:
+    """Return the number of the first line that configparser cannot read; None if there is none in a section.
+
+    configparser itself collects all such lines, in a time that grows with the square of their number. Before the first
+    section it stops at the first one.
+    """
+    parser = configparser.RawConfigParser
+    is_in_section = False
+    option_indent: int | None = None  # a line that is indented deeper than an option continues its value
+    for number, line in enumerate(text.split("\n"), start=1):
+        content = _COMMENT.sub("", line).strip()
+        indent = len(line) - len(line.lstrip())
+        if not content or (option_indent is not None and indent > option_indent):
+            continue
+        if parser.SECTCRE.match(content):
+            is_in_section, option_indent = True, None
+        elif not is_in_section:
+            return None
+        elif (option := parser.OPTCRE.match(content)) is not None and option["option"]:
+            option_indent = indent
+        else:
+            return number
+    return None
 
 
 def _value(dictionary: ObjectDictionary, where: str, index: int, subindex: int) -> int:

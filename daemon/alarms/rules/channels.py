@@ -22,7 +22,13 @@ _WHY = {
 }
 
 
-@rule("critical", "Check that the machine is on, and check the cable between bus and adapter.", after_s=1, hold_s=3)
+@rule(
+    "critical",
+    "Check that the machine is on, and check the cable between bus and adapter.",
+    after_s=1,
+    hold_s=3,
+    needs_storing=True,
+)
 def link_silent(evidence: Evidence) -> Iterator[Finding]:
     """A CAN link has been open for 5 s, but no frame has arrived on it since its silent channels were last received.
 
@@ -30,12 +36,16 @@ def link_silent(evidence: Evidence) -> Iterator[Finding]:
     arrived.
     """
     for link, channels in _by_link(evidence).items():
-        if evidence.is_storing and _is_quiet(evidence, link, channels) and _has_started(evidence, channels[0]):
+        if _is_quiet(evidence, link, channels) and _has_started(evidence, channels[0]):
             yield link, "the link is open, but nothing is received on it"
 
 
 @rule(
-    "critical", "Check the encoder's power and cable; without this joint no fix can be used.", after_s=1.0, hold_s=3.0
+    "critical",
+    "Check the encoder's power and cable; without this joint no fix can be used.",
+    after_s=1.0,
+    hold_s=3.0,
+    needs_storing=True,
 )
 def joint_silent(evidence: Evidence) -> Iterator[Finding]:
     """No reading of a joint has arrived for 1 s longer than its timeout, and its link has been open for 5 s.
@@ -50,6 +60,7 @@ def joint_silent(evidence: Evidence) -> Iterator[Finding]:
     "Check the signal's device and cable; effects that need this signal cannot be identified.",
     after_s=1.0,
     hold_s=3.0,
+    needs_storing=True,
 )
 def signal_silent(evidence: Evidence) -> Iterator[Finding]:
     """No reading of a machine signal has arrived for 1 s longer than its timeout.
@@ -59,7 +70,9 @@ def signal_silent(evidence: Evidence) -> Iterator[Finding]:
     yield from _silent(evidence, "signal")
 
 
-@rule("critical", "Check the device; without this joint no fix can be used.", after_s=1.5, hold_s=3.0)
+@rule(
+    "critical", "Check the device; without this joint no fix can be used.", after_s=1.5, hold_s=3.0, needs_storing=True
+)
 def joint_not_usable(evidence: Evidence) -> Iterator[Finding]:
     """The readings of a joint carry no usable value.
 
@@ -70,7 +83,13 @@ def joint_not_usable(evidence: Evidence) -> Iterator[Finding]:
     yield from _not_usable(evidence, "joint")
 
 
-@rule("warning", "Check the device; effects that need this signal cannot be identified.", after_s=1.5, hold_s=3.0)
+@rule(
+    "warning",
+    "Check the device; effects that need this signal cannot be identified.",
+    after_s=1.5,
+    hold_s=3.0,
+    needs_storing=True,
+)
 def signal_not_usable(evidence: Evidence) -> Iterator[Finding]:
     """The readings of a machine signal carry no usable value.
 
@@ -106,7 +125,7 @@ def _has_started(evidence: Evidence, channel: ChannelStatus) -> bool:
 
 def _silent(evidence: Evidence, kind: str) -> Iterator[Finding]:
     for link, channels in _by_link(evidence).items():
-        if not evidence.is_storing or _is_quiet(evidence, link, channels):
+        if _is_quiet(evidence, link, channels):
             continue
         for channel in channels:
             if channel.kind == kind and channel.status == SILENT and _has_started(evidence, channel):

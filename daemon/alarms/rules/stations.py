@@ -17,6 +17,7 @@ _TURNED_AWAY = (LockState.STANDBY, LockState.SEARCHING, LockState.WAITING, LockS
     "critical",
     "Check that the station is on; check its cable and its settings (baud rate, parity, line end).",
     hold_s=3.0,
+    needs_storing=True,
 )
 def station_silent(evidence: Evidence) -> Iterator[Finding]:
     """A station has sent no records for longer than its timeout, and none of its captures wait to be decoded.
@@ -28,8 +29,7 @@ def station_silent(evidence: Evidence) -> Iterator[Finding]:
     speaks = {link.name for link in evidence.acquisition.links if link.captures_per_s > 0.0}
     gaps = {gap.channel for gap in evidence.acquisition.gaps if gap.reason == GapReason.SILENT}
     for station in evidence.acquisition.stations:
-        is_silent = station.status == SILENT and (station.name in gaps or station.name not in speaks)
-        if evidence.is_storing and is_silent:
+        if station.status == SILENT and (station.name in gaps or station.name not in speaks):
             yield station.name, "the station sends no records", "warning" if evidence.session is None else "critical"
 
 
@@ -38,6 +38,7 @@ def station_silent(evidence: Evidence) -> Iterator[Finding]:
     "Aim the station at the session's prism, and check whether something blocks the line of sight.",
     after_s=2.5,
     hold_s=3,
+    needs_storing=True,
 )
 def station_not_locked(evidence: Evidence) -> Iterator[Finding]:
     """A station has followed no prism for 2.5 s while a session is open.
@@ -51,7 +52,11 @@ def station_not_locked(evidence: Evidence) -> Iterator[Finding]:
 
 
 @rule(
-    "critical", "Level the instrument, or switch its compensator on; then describe a new set-up.", after_s=3, hold_s=3
+    "critical",
+    "Level the instrument, or switch its compensator on; then describe a new set-up.",
+    after_s=3,
+    hold_s=3,
+    needs_storing=True,
 )
 def station_tilted(evidence: Evidence) -> Iterator[Finding]:
     """A station has reported for 3 s that its compensator is out of range or off; its fixes are not used."""

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import threading
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from daemon.acquisition.status.snapshot import AcquisitionStatus, ChannelStatus, FrameStatus, LinkStatus
 from daemon.alarms.alarm import Finding, Rule, rule
 from daemon.alarms.board import GRACE_S, AlarmBoard
 from daemon.alarms.evidence import Evidence
@@ -237,3 +240,36 @@ def test_critical_alarms_come_first_and_older_ones_before_younger(tmp_path: Path
     rig.pass_s(4, one="a", two="b")
     assert rig.active() == ["one", "two", "minor"]
     rig.store.close()
+
+
+def test_alarms_of_silent_devices_neither_end_nor_begin_while_the_disk_does_not_answer(tmp_path: Path) -> None:
+    clock = ManualClock(at(0))
+    joint = ChannelStatus("theta1", "deg", None, "silent", 9.0, "ok", "boom", "joint")
+    links = [LinkStatus("boom", up=True, since_s=99.0)]
+    told: list[tuple[str, str]] = []
+    channels = [joint, replace(joint, name="theta2", status="ok", age_s=0.1)]
+    frames = [FrameStatus("boom", "181", "", 5, None, 0.1, None)]
+    now = AcquisitionStatus(links=links, channels=channels, frames=frames)
+
+    def looked(seconds: int) -> list[str]:
+        for _ in range(seconds):
+            clock.advance(1.0)
+            board.evaluate()
+        return [alarm["subject"] for alarm in board.status()["active"] if alarm["kind"] == "joint_silent"]
+
+    with contextlib.closing(Store(tmp_path / "rigcal.sqlite")) as store:
+        board = AlarmBoard(
+            AlarmTable(store),
+            lambda: Evidence(clock.now(), acquisition=now),
+            clock,
+            tell=lambda notice: told.append((notice.event, notice.kind)),
+        )
+        assert looked(5) == ["theta1"]
+        seen = now
+        silent = [replace(one, status="silent") for one in seen.channels]  # none is decoded: every device seems silent
+        for hindrance in ({"is_write_hung": True}, {"error": "the disk is full"}):
+            now = replace(seen, channels=silent, **hindrance)
+            assert looked(10) == ["theta1"], hindrance
+        assert ("cleared", "joint_silent") not in told
+        now = replace(seen, channels=[replace(one, status="ok") for one in seen.channels])
+        assert looked(10) == []

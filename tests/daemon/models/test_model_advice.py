@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import errno
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NoReturn
 
 import pytest
 
-from calibration.errors import CalibrationError
 from daemon.cli.lines.state import model_lines
 from daemon.commands import CommandError
 from tests.daemon.support.models import ModelRig
@@ -50,17 +50,25 @@ def comparisons(rig: ModelRig, model: int) -> list[str]:
 
 
 @pytest.mark.long
-def test_a_model_that_could_not_be_loaded_for_want_of_memory_is_recommended_once_it_can(
-    rig: ModelRig, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("place", "error", "told"),
+    [
+        ("calibration.model.files.read_npz", MemoryError(), "this computer has too little memory to load the model"),
+        ("calibration.model.files.parse_rig", MemoryError(), "this computer has too little memory to load the model"),
+        ("daemon.warm_up.prepare", OSError(errno.ENOSPC, "No space left on device"), "No space left on device"),
+    ],
+)
+def test_a_model_that_the_computer_could_not_load_is_recommended_once_it_can(
+    rig: ModelRig, monkeypatch: pytest.MonkeyPatch, place: str, error: Exception, told: str
 ) -> None:
     model = rig.compared(rig.candidate(), live=None)
 
-    def lacks_memory(_: object) -> NoReturn:
-        raise CalibrationError("this computer has no memory left")
+    def lacking(*_: object) -> NoReturn:
+        raise error
 
     with monkeypatch.context() as short:
-        short.setattr(rig.registry._live, "load", lacks_memory)
-        assert "no memory left" in advice(rig)
+        short.setattr(place, lacking)
+        assert told in advice(rig)
     assert f"model accept {model}" in advice(rig)
     assert rig.registry.accept_command({"id": model})["live"] == model
 

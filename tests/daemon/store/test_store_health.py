@@ -23,12 +23,12 @@ from daemon.service import Daemon
 from daemon.store import Reader, Store, StoreError
 from daemon.store.files import FileIdentity
 from drivers.clock import SystemClock
-from drivers.readings import Capture
+from drivers.readings import Capture, DeviceEvent, EventKind
 from tests.daemon.support.acquisition import ListLink, wait_until
 from tests.daemon.support.damage import fill, small_disk, tear
 from tests.daemon.support.idle_daemon import running as run_daemon
 from tests.daemon.support.jobs import SOURCE, JobRig
-from tests.daemon.support.store import frame, table
+from tests.daemon.support.store import at, frame, table
 from tests.daemon.support.watch import results, settled, watched
 
 # ---- damage ----------------------------------------------------------------------------------------------------------
@@ -104,6 +104,27 @@ def test_a_file_of_the_store_that_another_takes_the_place_of_is_noticed_until_it
         aside.rename(file)
         watch.look()
         assert (watch.health.state, watch.health.text) == ("ok", "")
+
+
+def test_a_store_that_is_overwritten_by_a_copy_of_itself_is_damaged_and_checked_at_the_next_start(path: Path) -> None:
+    def store_events(store: Store, count: int) -> None:
+        store.insert_records([DeviceEvent("boom", at(k), EventKind.WARNING, "text " * 40, k) for k in range(count)])
+        store._db.conn.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+
+    with watched(path, ends_in_order=False) as (store, watch):  # as the daemon does with a damaged store
+        store_events(store, 500)
+        copy = path.read_bytes()
+        store_events(store, 2000)
+        watch.look()
+        assert watch.health.state == "ok"
+        path.write_bytes(copy)  # as `cp` does: the file keeps its identity
+        for _ in range(2):
+            watch.look()
+            assert watch.health.state == "damaged"
+            assert "another program has overwritten it" in watch.health.text
+    with watched(path) as (_, watch):
+        assert settled(watch) in ("ok", "damaged")
+    assert results(path)
 
 
 def test_the_log_of_a_store_that_is_a_link_is_watched_and_saved_too(path: Path, tmp_path: Path) -> None:

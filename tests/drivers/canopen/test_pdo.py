@@ -1,12 +1,13 @@
 from __future__ import annotations
 
+import configparser
 from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.canopen.pdo import PdoMapping, TransmitPdo
+from drivers.canopen.pdo import PdoMapping, TransmitPdo, _first_bad_line
 from drivers.errors import DescriptionError
 from tests.drivers.can_support import EDS
 
@@ -116,3 +117,20 @@ def test_a_pdo_that_the_eds_lacks_is_named() -> None:
 def test_a_missing_eds_is_named(tmp_path: Path) -> None:
     with pytest.raises(DescriptionError, match=r"none\.eds: cannot be read: No such file"):
         TransmitPdo.from_eds(tmp_path / "none.eds", 32, 1)
+
+
+@given(
+    st.lists(
+        st.sampled_from(
+            ["[a]", "[a", "a=1", " a=1", "  b", "b", "", ";c", "#c", " ;c", "=1", "a ;c", "a: 1", "a=1 ;c=2"]
+        )
+    )
+)
+def test_a_bad_line_of_an_eds_file_is_one_that_its_parser_refuses(lines: list[str]) -> None:
+    text = "\n".join(["[s]", *lines])
+    refused = None
+    try:
+        configparser.RawConfigParser(inline_comment_prefixes=(";",), strict=False).read_string(text)
+    except configparser.ParsingError as error:
+        refused = error.errors[0][0]
+    assert _first_bad_line(text) == refused

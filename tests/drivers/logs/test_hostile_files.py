@@ -268,6 +268,14 @@ def test_an_eds_file_with_a_long_run_of_blanks_does_not_hang(tmp_path: Path) -> 
         TransmitPdo.from_eds(path, 32, 1)
 
 
+@pytest.mark.parametrize("line", ["a", " a", "=1", "[a"])
+def test_an_eds_file_of_many_bad_lines_is_refused_at_the_first(tmp_path: Path, line: str) -> None:
+    path = tmp_path / "bad.eds"
+    path.write_text("[DeviceInfo]\n" + f"{line}\n" * 300_000)  # an hour, if all were collected
+    with pytest.raises(DescriptionError, match=r"line 2 is neither \[section\] nor name=value"):
+        TransmitPdo.from_eds(path, 32, 1)
+
+
 def test_an_eds_file_is_never_read_as_xml_whatever_it_is_called(tmp_path: Path) -> None:
     path = tmp_path / "device.epf"
     path.write_bytes(b'<?xml version="1.0"?><!DOCTYPE a [<!ENTITY a "aaaa"><!ENTITY b "&a;&a;">]><a>&b;</a>')
@@ -277,7 +285,7 @@ def test_an_eds_file_is_never_read_as_xml_whatever_it_is_called(tmp_path: Path) 
 
 def test_a_message_that_quotes_a_whole_file_is_cut(tmp_path: Path) -> None:
     path = tmp_path / "device.eds"
-    path.write_text("[FileInfo]\n" + "no key here\n" * 1000, encoding="latin-1")
-    with pytest.raises(DescriptionError, match=r"parsing errors.*\.\.\.$") as caught:
+    path.write_text("no section " * 1000, encoding="latin-1")
+    with pytest.raises(DescriptionError, match=r"no section headers.*\.\.\.$") as caught:
         TransmitPdo.from_eds(path, 32, 1)
     assert len(str(caught.value)) < 1100
