@@ -224,6 +224,7 @@ class Daemon:
             "zeros_lost": sessions.zeros_lost,
             "control_faults": self._control_faults,
             "ended_threads": self._ended_threads.found,
+            "meter_fault": lambda: self._guide.meter_fault,
             "clock_lost": lambda: None if self._time is None else self._time.lost(),
             "notice_faults": self._notices.faults,
             "metrics_fault": lambda: None if self._metrics is None else self._metrics.trouble(),

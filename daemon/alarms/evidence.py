@@ -45,6 +45,7 @@ class Evidence:
         zeros_lost: joints whose encoder has jumped since the newest closed session was started or accepted, and whose
             zero has not been checked.
         ended_threads: thread of the daemon that an error has ended -> the error.
+        meter_fault: why the open guide gets no answer from its gain meter, a clause; None if it does.
         clock_lost: when the computer's clock was last synchronised, if it no longer is.
         unwatched: rule or part of the evidence that has itself failed -> why.
     """
@@ -70,6 +71,7 @@ class Evidence:
     untrained_sessions: Mapping[str, str] = field(default_factory=dict)
     zeros_lost: Sequence[str] = ()
     ended_threads: Mapping[str, str] = field(default_factory=dict)
+    meter_fault: str | None = None
     clock_lost: Stamp | None = None
     unwatched: Mapping[str, str] = field(default_factory=dict)
 
@@ -134,6 +136,7 @@ _PARTS = {
     "metrics_fault": "the metrics",
     "notice_faults": "the notices",
     "ended_threads": "the daemon's threads",
+    "meter_fault": "the gain meter",
     "clock_lost": "the computer's clock",
 }
 

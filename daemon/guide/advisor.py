@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
@@ -12,7 +13,10 @@ from daemon.guide.meter_link import Answer, MeterLink, Place
 from daemon.guide.stop_rule import Forecast, least_poses, stop_reason
 from drivers.clock import Clock
 
+log = logging.getLogger(__name__)
+
 AHEAD = 5  # poses that the meter looks ahead
+HUNG = "the gain meter, which chooses the poses, did not answer in time and was restarted"
 
 Take = Callable[[str, list[Pose], str], None]
 """Receives a session, the poses chosen for it, and why there are none ("" if there are some)."""
@@ -47,11 +51,14 @@ class Advisor:
 
     @property
     def is_alive(self) -> bool:
-        """Return True while the process runs."""
+        """Return True while the process runs and answers in time."""
         return self._meter is not None and self._meter.is_alive
 
     def start(self) -> None:
         """Start or restart the process."""
+        if self._meter is not None and self._meter.is_late:
+            log.warning("the gain meter (process %d) did not answer in time; it is restarted", self._meter.pid)
+            self.trouble = HUNG
         self.close()
         try:
             self._meter = MeterLink(self._place())

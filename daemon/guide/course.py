@@ -19,7 +19,7 @@ from daemon.guide.advisor import Advisor
 from daemon.guide.job import Job, Pose
 from daemon.guide.meter_link import Place
 from daemon.guide.position import PositionWatch
-from daemon.guide.record import GuideRecord, is_on_prism
+from daemon.guide.record import GuideRecord, GuideStep, is_on_prism
 from daemon.sessions.manager import SessionManager
 from daemon.store.queries.guides import Standstill
 from daemon.store.queries.sessions import SessionTable
@@ -115,13 +115,13 @@ class Course:
 
     # ---- events ------------------------------------------------------------------------------------------------------
 
-    def happen(self, kind: str, details: Mapping[str, Any], *, only_at: str = "") -> bool:
+    def happen(self, kind: str, details: Mapping[str, Any], *, only_at: GuideStep | None = None) -> bool:
         """Store an event and carry out its consequences after the commit.
 
         Args:
             kind: kind of the event, as in `job`.
             details: details of the event, as in `job`.
-            only_at: step at which the event must happen; "" for any.
+            only_at: step at which the event must happen; None for any.
 
         Returns:
             False if the guide is at a step other than `only_at`; the event is then not stored.
@@ -142,9 +142,11 @@ class Course:
                 self._sessions.abort_command({})
             self.happen("stopped", {"reason": reason})
 
-    def aimed(self) -> None:
-        """Count fixes from now on: the station is on the prism."""
+    def aimed(self, *, only_at: GuideStep | None = None) -> None:
+        """Count fixes from now on: the station is on the prism. Does nothing at a step other than `only_at`."""
         with self.at_once():
+            if only_at not in (None, self.record.step):
+                return
             self._store.once_committed(self.watch.forget_fixes)
             self._sessions.look_back(self.record.row.operator if self.record.row else "")
             self.happen("aimed", {})
@@ -157,7 +159,7 @@ class Course:
         on_prism, was_on_prism = is_on_prism(job), is_on_prism(before)
         if was_on_prism and not on_prism:
             self._sessions.look_away()
-        if job.at != before.at:
+        if (job.at, job.run.label) != (before.at, before.run.label):  # a standstill counts for one pose
             self.standstill = None
         if on_prism and (job.run.done != before.run.done or job.run.poses != before.run.poses or not was_on_prism):
             self._assess()

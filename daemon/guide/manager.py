@@ -13,7 +13,7 @@ from calibration.rig.description import Rig
 from daemon.acquisition.joiner import ObservationJoiner
 from daemon.commands import HOW_TO_END, REFUSED, CommandError, Handler, mapping_argument, text_argument
 from daemon.control.command_table import checked_arguments
-from daemon.guide.advisor import accuracy_view
+from daemon.guide.advisor import HUNG, accuracy_view
 from daemon.guide.course import Course
 from daemon.guide.job import Job
 from daemon.guide.meter_link import Place
@@ -106,6 +106,11 @@ class GuideManager:
                 REFUSED,
             )
 
+    @property
+    def meter_fault(self) -> str | None:
+        """Why the open guide gets no answer from its gain meter, a clause; None if it does."""
+        return HUNG if self._record.is_open and self._course.advisor.trouble == HUNG else None
+
     # ---- commands ----------------------------------------------------------------------------------------------------
 
     def start_command(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
@@ -182,6 +187,11 @@ class GuideManager:
             assert step is not None
             if step.kind == "close" or (rest and step.kind != "poses"):
                 raise CommandError(f"this step cannot be skipped: {headline(job)}", REFUSED)
+            if step.kind == "poses" and job.run.poses is None and not rest:
+                raise CommandError(
+                    f"this step cannot be skipped: {headline(job)}; with `rest`, all poses of the prism are skipped",
+                    REFUSED,
+                )
             with self._course.at_once():
                 self._record.tapped()
                 if step.kind == "change_prism" and self._sessions.open_session() is not None:

@@ -5,9 +5,11 @@ from __future__ import annotations
 import contextlib
 import json
 import logging
+import math
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -22,6 +24,10 @@ log = logging.getLogger(__name__)
 # -P keeps the current directory, which holds no code of rigcal, off the module path.
 METER_COMMAND = (sys.executable, "-P", "-m", "daemon.guide.meter")
 MAX_LOGGED_BYTES = 4096
+# Longest time for an answer, at least ten times what a desktop computer needs to compile the kernels and to choose each
+# pose, because a rig's computer is slower and busy.
+ANSWER_S, POSE_S = 120.0, 3.0
+_END_S = 2.0  # a killed process that waits for a hung disk ends only once the disk answers
 
 Answer = Mapping[str, Any]
 """`{"result": {...}}` or `{"error": "one sentence"}`."""
@@ -89,6 +95,7 @@ class MeterLink:
         self._waiting: dict[str, tuple[Mapping[str, Any], Callable[[Answer], None]]] = {}
         self._asked = threading.Condition()
         self._is_closing = False
+        self._due = time.monotonic() + ANSWER_S  # for the process to read its order, then to answer a question
         self._order = place.to_line()
         threading.Thread(target=self._work, name="gain-meter", daemon=True).start()
         threading.Thread(target=self._log, name="gain-meter-log", daemon=True).start()
@@ -110,12 +117,18 @@ class MeterLink:
             self._is_closing = True
             self._asked.notify_all()
         self._process.kill()
-        self._process.wait()
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self._process.wait(_END_S)
+
+    @property
+    def is_late(self) -> bool:
+        """Return True if a question was not answered in time: the process hangs."""
+        return time.monotonic() > self._due
 
     @property
     def is_alive(self) -> bool:
-        """Return True while the process runs."""
-        return self._process.poll() is None
+        """Return True while the process runs and answers in time."""
+        return self._process.poll() is None and not self.is_late
 
     def _work(self) -> None:
         assert self._process.stdin is not None
@@ -124,11 +137,14 @@ class MeterLink:
         with contextlib.suppress(OSError), self._process.stdout as answers, self._process.stdin as questions:
             questions.write(self._order)
             questions.flush()
+            self._due = math.inf
             while (asked := self._next()) is not None:
                 question, take = asked
+                self._due = time.monotonic() + ANSWER_S + POSE_S * question.get("count", 0)
                 questions.write(json.dumps(question).encode() + b"\n")
                 questions.flush()
                 answer = answers.readline()
+                self._due = math.inf
                 if self._is_closing:
                     return
                 if not answer.endswith(b"\n"):

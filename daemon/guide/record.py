@@ -17,6 +17,9 @@ from drivers.clock import Clock, Stamp
 
 log = logging.getLogger(__name__)
 
+GuideStep = tuple[int, str]
+"""ID of a guide and of one of its steps; differs between all steps of all guides."""
+
 
 class GuideRecord:
     """The newest guide, open or not.
@@ -52,6 +55,12 @@ class GuideRecord:
         row, job = self.row, self.job
         return (row, job) if row is not None and job is not None and job.state == "open" else None
 
+    @property
+    def step(self) -> GuideStep | None:
+        """The open guide and its step; None if there is none."""
+        guide = self.opened()
+        return None if guide is None else (guide[0].id, guide[1].step_id)
+
     def needs_step(self, arguments: Mapping[str, Any]) -> tuple[Job, str]:
         """Return the job and its step; CommandError without an open guide or if `step` names a different step."""
         job = self.job
@@ -77,21 +86,27 @@ class GuideRecord:
                 self.table.count_taps(self.row.id, taps)
             self._store.once_committed(partial(self._count, taps))
 
-    def happen(self, kind: str, details: Mapping[str, Any], only_at: str = "") -> tuple[Job, Job] | None:
+    def happen(self, kind: str, details: Mapping[str, Any], only_at: GuideStep | None = None) -> tuple[Job, Job] | None:
         """Store an event, which takes effect once it is committed.
 
         Args:
             kind: kind of the event, as in `job`.
             details: details of the event, as in `job`.
-            only_at: step at which the event must happen; "" for any.
+            only_at: step at which the event must happen; None for any.
 
         Returns:
             The states before and after; None if the guide is not open or at a step other than `only_at`.
+
+        Raises:
+            CommandError: the event cannot happen at the guide's step.
         """
         row, before = self.row, self.job
-        if row is None or before is None or before.state != "open" or only_at not in ("", before.step_id):
+        if row is None or before is None or before.state != "open" or only_at not in (None, self.step):
             return None
-        job, at = before.after(kind, details), self._clock.now()
+        try:
+            job, at = before.after(kind, details), self._clock.now()
+        except ValueError as error:
+            raise CommandError(f"{error}; the guide is at this step: {headline(before)}", REFUSED) from error
         with self._store.transaction():
             self.table.add(row.id, kind, details, at, **caller_columns())
             if job.state != "open":

@@ -17,6 +17,7 @@ from daemon.commands import CHECK, CommandError, acting_for
 from daemon.guide.course import Course
 from daemon.guide.job import Job
 from daemon.guide.position import is_there, joints_of
+from daemon.guide.record import GuideStep
 from daemon.guide.request import misfit
 from daemon.host.worker_thread import WorkerThread
 from daemon.sessions.manager import SessionManager
@@ -104,8 +105,8 @@ class GuideWorker(WorkerThread):
     def _look(self) -> None:
         course = self._course
         with course.record.turn:
-            job = course.record.job
-            if job is None or job.step is None:
+            job, at = course.record.job, course.record.step
+            if job is None or job.step is None or at is None:
                 return
             if not course.advisor.is_alive:
                 course.start_advisor()
@@ -116,22 +117,26 @@ class GuideWorker(WorkerThread):
             if run.session and run.poses is None:
                 course.choose(run.most)
             is_at_point = not self._has_aim and course.watch.is_at(course.point_mm(course.point(job)))
-        with acting_for(None, self._cancelled.is_set):
+        with acting_for(None, partial(self._is_over, at)):
             if not run.session:
-                self._try(self._open_session)
+                self._try(self._open_session, at)
             elif step.kind == "close":
-                self._try(self._close_session)
+                self._try(partial(self._close_session, at), at)
             elif step.kind == "shoot_control_point":
                 if self._has_aim or is_at_point or self.wanted == step_id:
-                    self._try(partial(self._shoot, step.point, step_id), step_id)
+                    self._try(partial(self._shoot, step.point, at), at, step_id)
             elif step.kind == "change_prism":
                 if self._has_aim:
-                    course.aimed()
+                    course.aimed(only_at=at)
             elif job.is_enough and (self._has_aim or is_at_point or run.kind == CHECK):
-                course.happen("left", {}, only_at=step_id)
+                course.happen("left", {}, only_at=at)
             elif not job.is_enough:
                 self._send_boom(job)
-                self._look_at_pose(job)
+                self._look_at_pose(job, at)
+
+    def _is_over(self, at: GuideStep) -> bool:
+        """Return True if work for a step is cancelled, or the guide is no longer at that step."""
+        return self._cancelled.is_set() or self._course.record.step != at
 
     def _send_boom(self, job: Job) -> None:
         """Send a boom without an operator to the next pose; send it again if the pose was not measured."""
@@ -145,62 +150,80 @@ class GuideWorker(WorkerThread):
         joints = run.poses[number].joints
         self._drive([{"dwell_s": _STANDS_S} | {joint.column: joints[joint.name] for joint in self._rig.joints}])
 
-    def _look_at_pose(self, job: Job) -> None:
+    def _look_at_pose(self, job: Job, at: GuideStep) -> None:
         """Check whether the pose is reached and measured."""
         run, number = job.run, job.run.next_pose
         found = self._course.record.table.standstill(run.session, run.last)
-        self._course.standstill = found = None if found is None or found.pose == run.label else found
+        found = None if found is None or found.pose == run.label else found
+        with self._course.record.turn:
+            if self._course.record.step != at:
+                return
+            self._course.standstill = found
         if number is None or run.poses is None or found is None or found.fixes < NEEDED_FIXES:
             return
         if is_there(self._rig, joints_of(self._rig, found), run.poses[number].joints):
-            self._course.happen("measured", {"pose": found.pose, "last": found.last}, only_at=job.step_id)
+            self._course.happen("measured", {"pose": found.pose, "last": found.last}, only_at=at)
 
-    def _try(self, work: Callable[[], None], step_id: str = "") -> None:
-        """Do work that may fail until an operator helps; retry it after a pause, or a manual shot on request."""
+    def _try(self, work: Callable[[], None], at: GuideStep, step_id: str = "") -> None:
+        """Do a step's work, which may fail until an operator helps; retry it after a pause, or a shot on request."""
         self.busy = step_id or "session"
         try:
             work()
         except CommandError as error:
-            if not self._cancelled.is_set():
+            if not self._is_over(at):
                 job = self._course.record.job
                 if job is not None and job.trouble != str(error):  # each retry may fail with the same message
-                    self._course.happen("failed", {"text": str(error)})
+                    self._course.happen("failed", {"text": str(error)}, only_at=at)
                 self._course.wait()
         finally:
-            if step_id:
+            if self.wanted == step_id:  # not a button that was pressed at a later step
                 self.wanted = ""
             self.busy = ""
 
     def _open_session(self) -> None:
-        job, row = self._course.record.job, self._course.record.row
-        if job is None or row is None:
-            return
-        if self._setups.has_moved(row.setup_id):  # no session is possible at this set-up any more
-            self._course.abandon(_MOVED)
-            return
+        with self._course.record.turn:
+            guide = self._course.record.opened()
+            if guide is None:
+                return
+            row, job = guide
+            if self._setups.has_moved(row.setup_id):  # no session is possible at this set-up any more
+                self._course.abandon(_MOVED)
+                return
         last, opened = self._course.record.table.newest_observation(), self._sessions.open_session()
         wanted = {"prism": job.run.prism, "kind": job.run.kind, "setup": row.setup_id, "note": f"guide {row.id}"}
         if opened is None or any(opened[key] != value for key, value in wanted.items()):
+            if opened is not None and opened["note"] == wanted["note"]:  # the guide's own, for a prism skipped since
+                self._abort(opened["id"])
             opened = self._sessions.start_command(wanted | {"operator": row.operator}, is_aimed=False)
         # Otherwise the session was opened just before the daemon ended.
         with self._course.at_once():
             guide, now = self._course.record.opened(), self._sessions.open_session()
-            if guide is not None and guide[0].id == row.id:
+            is_wanted = guide is not None and (guide[0].id, guide[1].at, guide[1].run.session) == (row.id, job.at, "")
+            if not is_wanted:  # the guide was abandoned, or its prism skipped, in the meantime
+                self._abort(opened["id"])
+            elif now is not None and now["id"] == opened["id"]:
                 self._course.happen("opened", {"session": opened["id"], "last": last})
-            elif now is not None and now["id"] == opened["id"]:  # the guide was abandoned in the meantime
+
+    def _abort(self, session: str) -> None:
+        with self._sessions.turn:
+            opened = self._sessions.open_session()
+            if opened is not None and opened["id"] == session:
                 self._sessions.abort_command({})
 
-    def _close_session(self) -> None:
-        job = self._course.record.job
-        if job is None:
-            return
-        opened = self._sessions.open_session()
-        if opened is not None and opened["id"] == job.run.session:
-            self._sessions.stop_command({})
-        self._course.happen("closed", {"session": job.run.session})
+    def _close_session(self, at: GuideStep) -> None:
+        with self._course.at_once():
+            job = self._course.record.job
+            if job is None or self._course.record.step != at:
+                return
+            opened = self._sessions.open_session()
+            if opened is not None and opened["id"] == job.run.session:
+                self._sessions.stop_command({})
+            self._course.happen("closed", {"session": job.run.session})
 
-    def _shoot(self, point: str, step_id: str) -> None:
+    def _shoot(self, point: str, at: GuideStep) -> None:
         shot = self._sessions.shoot_command({"point": point}, most_off_mm=CONTROL_POINT_RADIUS_MM)
-        self._course.happen("shot", {"point": point, "misclosure_mm": shot["misclosure_mm"]}, only_at=step_id)
-        if shot["moved"] and shot["phase"] == "start":  # no measurement from here on would be usable
-            self._course.abandon(_MOVED)
+        with self._course.record.turn:
+            guide = self._course.record.opened()
+            self._course.happen("shot", {"point": point, "misclosure_mm": shot["misclosure_mm"]}, only_at=at)
+            if shot["moved"] and shot["phase"] == "start" and guide is not None and guide[0].id == at[0]:
+                self._course.abandon(_MOVED)  # no measurement from here on would be usable

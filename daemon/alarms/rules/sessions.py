@@ -43,6 +43,20 @@ def session_open_long(evidence: Evidence) -> Iterator[Finding]:
 
 @rule(
     "warning",
+    "If the alarm stays, check with `rigcal doctor` whether the computer is overloaded. To go on without poses of this "
+    "prism, use `rigcal session guide --rest REASON`.",
+)
+def gain_meter_hangs(evidence: Evidence) -> Iterator[Finding]:
+    """The process that chooses the poses of the open guide did not answer in time, and was restarted.
+
+    It has 2 minutes to answer, and 3 s more for each pose to choose. Cleared when it answers, or when the guide ends.
+    """
+    if evidence.meter_fault is not None:
+        yield "guide", evidence.meter_fault
+
+
+@rule(
+    "warning",
     "Hold a new session with control shots at its start and end, or accept this one with "
     "`rigcal session accept SUBJECT`.",
 )

@@ -379,6 +379,7 @@ CASES: dict[str, list[tuple[Evidence, list[str], Evidence]]] = {
     "metrics_unserved": [(known(metrics_fault="the port is taken"), ["metrics"], known())],
     "notices_undelivered": [(known(notice_faults={"webhook": "no route"}), ["webhook"], known())],
     "clock_unsynchronized": [(known(clock_lost=NOW.shifted(-1000 * NS_PER_S)), ["clock"], known())],
+    "gain_meter_hangs": [(known(meter_fault="it did not answer in time"), ["guide"], known())],
     "thread_ended": [(known(ended_threads={"tip": "a fault"}), ["tip"], known())],
     "not_watched": [(known(unwatched={"the jobs": "a fault"}), ["the jobs"], known())],
 }
