@@ -212,7 +212,7 @@ class Daemon:
             "has_simulation_ended": self._parts.has_simulation_ended,
             "session": sessions.open_session,
             "suspicions": self._sessions.prism_suspicions,
-            "newest_excluded": partial(self._sessions.not_counting, FRESH_S),
+            "newest_excluded": self._sessions.not_counting,
             "prisms_fault": self._sessions.prisms_fault,
             "setup": SetupTable(self._store, self._parts.rig.name).current,
             "failed_jobs": self._job_table.failed,

@@ -29,7 +29,7 @@ class Evidence:
         has_simulation_ended: the process of a simulated rig has ended.
         session: the open session; None without one.
         suspicions: stations that may follow a prism other than the session's.
-        newest_excluded: why the open session's newest fix is not used, a clause; None if it is used, or old.
+        newest_excluded: why the open session's newest fix is not used, a clause; None if it is used.
         prisms_fault: why stations' prisms cannot be checked against the joints; None where they can.
         setup: the set-up that the station stands in.
         failed_jobs: failed jobs that need attention.

@@ -17,7 +17,7 @@ from daemon.guide.advisor import HUNG, accuracy_view
 from daemon.guide.course import Course
 from daemon.guide.job import Job
 from daemon.guide.meter_link import Place
-from daemon.guide.position import FRESH_S, is_there, joints_of
+from daemon.guide.position import is_there, joints_of
 from daemon.guide.request import request_of, whole_argument
 from daemon.guide.view import Around, headline, state_of
 from daemon.guide.worker import NEEDED_FIXES, Drive, GuideWorker
@@ -300,7 +300,7 @@ class GuideManager:
         if stands_s is None or stands_s < self._settle_s:
             return []
         settled_s = self._clock.real_seconds(stands_s - self._settle_s)
-        reason = self._sessions.not_counting(min(FRESH_S, settled_s))
+        reason = self._sessions.not_counting(settled_s)
         if reason is None:
             return []
         # Other reasons concern the joints or the computer, where aiming does not help.

@@ -25,6 +25,7 @@ from daemon.sessions.open_session import CONSTANT_TOLERANCE_MM, OpenSession
 from daemon.store.connection import rig_sha256
 from daemon.store.queries.jobs import JobTable
 from daemon.store.queries.observations import first_constants_mm
+from daemon.store.queries.poses import has_poses_before_enclosed, is_enclosed
 from daemon.store.queries.sessions import OTHER_RIG_FILE, ZERO_LOST, SessionTable, session
 from daemon.store.queries.setups import SetupTable
 from daemon.store.queries.zeros import lost_zeros, preset_jumps
@@ -72,8 +73,10 @@ class SessionLifecycle:
     def unfinished(self, rig_text: str) -> tuple[OpenSession | None, list[OpenSession]]:
         """Return the rig's open session, and ended sessions whose last captures are not yet decoded.
 
-        A session belongs to one rig file. A session started with a different file is closed, and gets no more fixes. A
-        session stored with the bare file, from before the store kept the decoding of channels, continues.
+        A session belongs to one rig file. A session started with a different file, of this rig or of another one, is
+        closed, and gets no more fixes. So is a session that another one followed: earlier versions left sessions of
+        other rigs open. A session stored with the bare file, from before the store kept the decoding of channels,
+        continues.
 
         Args:
             rig_text: the present rig file with the decoding of channels.
@@ -83,15 +86,11 @@ class SessionLifecycle:
         bare = without_decoding(rig_text)
         own = {rig_sha256(text) for text in (rig_text, bare, bare.removesuffix("\n"))}
         for row in self.table.unfinished():
-            if row["rig"] != self._rig.name:
+            is_own = row["rig"] == self._rig.name and row["rig_sha256"] in own
+            next_one = self.table.follower(row["id"]) if row["state"] == "open" else None
+            if not is_own or next_one is not None:
                 if row["state"] == "open":
-                    log.warning(
-                        "session %s of rig %s is open; it continues when rigcal runs that rig", row["id"], row["rig"]
-                    )
-                continue
-            if row["rig_sha256"] not in own:
-                if row["state"] == "open":
-                    self._close_of_another_file(row)
+                    self._close_of_another_file(row, next_one)
                 continue
             since, until = self._store.stamp(row, "started_"), self._store.stamp_or_none(row, "ended_")
             order = self._store.order
@@ -102,18 +101,26 @@ class SessionLifecycle:
                 ended.append(found)
         return opened, ended
 
-    def _close_of_another_file(self, row: Mapping[str, Any]) -> None:
-        """Close a session left open by the last run, as of that run's end, because the rig file has changed."""
-        why = "closed by rigcal: the rig file was changed while it was open"
-        last = self._store.previous_end or self._clock.now()
-        ended = max(self._store.stamp(row, "started_"), last, key=self._store.order)
+    def _close_of_another_file(self, row: Mapping[str, Any], next_one: str | None) -> None:
+        """Close a session left open by an earlier run, as of the end of the last run that measured in it.
+
+        Args:
+            row: the session.
+            next_one: session that was started while this one was open: the station may have been on its prism.
+        """
+        if row["rig"] != self._rig.name:
+            changed = f"the rig was changed from {row['rig']} to {self._rig.name}"
+        else:
+            changed = f"session {next_one} was started" if next_one else "the rig file was changed"
+        why = f"closed by rigcal: {changed} while it was open"
+        excluded = f"it was still open when session {next_one} was started" if next_one else None
         with self._store.transaction():
             self.table.change(
                 row["id"],
                 state="closed",
                 note="; ".join(filter(None, (row["note"], why))),
-                excluded=self._why_not_used(row["id"]),
-                **self._store.instant(ended, "ended_"),
+                excluded=excluded or self._why_not_used(row["id"]),
+                **self._store.instant(self.table.last_measured(row["id"]), "ended_"),
             )
         log.warning("session %s (prism %s): %s; start a new session", row["id"], row["prism"], why)
 
@@ -276,10 +283,9 @@ class SessionLifecycle:
             )
         if not self.table.points_shot(session_id, "start") & self.table.points_shot(session_id, "end"):
             return NOT_SHOT
-        if self.table.has_poses_before_enclosed(session_id):
+        if has_poses_before_enclosed(self._store, session_id):
             return NOT_THE_SAME
-        poses, enclosed = self.table.count_poses(session_id)
-        return NOT_ENCLOSED if enclosed < LEAST_ENCLOSED * poses else None
+        return None if is_enclosed(self._store, session_id, LEAST_ENCLOSED) else NOT_ENCLOSED
 
 
 def _has_other_readings(closed: Mapping[str, Any]) -> bool:

@@ -99,7 +99,7 @@ class SessionManager:
         self._shot: Shot | None = None
         self._pending = PendingWrites(store)
         self._prisms = PrismWatch(store, rig, clock, limits or {}, self._pending.add_event)
-        self._observing = ObservationMaker(rig, store, self._pending, self._prisms, run_id)
+        self._observing = ObservationMaker(rig, store, self._observations, self._pending, self._prisms, run_id)
         self._advice = SessionAdvice(rig, setups, self._table, self._prisms)
         self._late: set[str] = set()  # sessions that got fixes after their end, and must be judged again
         # Fixes measured in ended sessions may still arrive, or wait for their joints
@@ -194,12 +194,12 @@ class SessionManager:
         """Close the open session; its jobs start by themselves."""
         with self.turn:
             session = self._close("closed")
-            return self._table.summary(session.id) | {"advice": self._advice.at_end(session)}
+            return self._table.summary(session.id, self._observations.tally) | {"advice": self._advice.at_end(session)}
 
     def abort_command(self, _arguments: Mapping[str, Any]) -> dict[str, Any]:
         """Close the open session as unusable: it is kept, but never used for calibration."""
         with self.turn:
-            return self._table.summary(self._close("aborted").id)
+            return self._table.summary(self._close("aborted").id, self._observations.tally)
 
     def accept_command(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
         """Let calibration use a closed session although nothing shows that the station stood still."""
@@ -277,7 +277,7 @@ class SessionManager:
         if session is None:
             return None
         suspicions = [as_dict(suspicion) for suspicion in self._prisms.suspicions(session)]
-        return self._table.summary(session.id) | {"prism_suspicions": suspicions}
+        return self._table.summary(session.id, self._observations.tally) | {"prism_suspicions": suspicions}
 
     def aim_again(self) -> None:
         """Aim the station again if it may be on another prism and a program can aim it."""
@@ -323,17 +323,17 @@ class SessionManager:
         """Return why stations' prisms cannot be checked against the joints, a clause; None if they can."""
         return self._prisms.trouble()
 
-    def not_counting(self, fresh_s: float) -> str | None:
+    def not_counting(self, within_s: float = math.inf) -> str | None:
         """Return why the newest fix of the open session is not used; may be called from any thread.
 
         Args:
-            fresh_s: largest age of the fix, real seconds; for an older fix None is returned.
+            within_s: largest time since the fix was measured, real seconds; for an older fix None is returned.
         """
         opened, newest = self._open, self._observing.newest
         if opened is None or newest is None or newest[0] != opened.id:
             return None
         age_s = self._clock.now().since(newest[1]) / NS_PER_S
-        return newest[2] if self._clock.real_seconds(age_s) <= fresh_s else None
+        return newest[2] if self._clock.real_seconds(age_s) <= within_s else None
 
     # ---- parts -------------------------------------------------------------------------------------------------------
 

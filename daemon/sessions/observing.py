@@ -97,6 +97,7 @@ class ObservationMaker:
     Args:
         rig: the machine.
         store: the database.
+        table: its observations.
         pending: queue of changes to the store.
         prisms: decides which fixes are of another prism.
         run_id: number of this run of the daemon; poses are numbered within a run.
@@ -105,9 +106,11 @@ class ObservationMaker:
         newest: session and instant of the newest observation, and why it is not used; None before the first.
     """
 
-    def __init__(self, rig: Rig, store: Store, pending: PendingWrites, prisms: PrismWatch, run_id: int) -> None:
+    def __init__(
+        self, rig: Rig, store: Store, table: ObservationTable, pending: PendingWrites, prisms: PrismWatch, run_id: int
+    ) -> None:
         self._rig, self._store, self._pending, self._prisms, self._run_id = rig, store, pending, prisms, run_id
-        self._table = ObservationTable(store)
+        self._table = table
         self._places = StandstillPlaces(rig)
         self.newest: tuple[str, Stamp, str | None] | None = None
 

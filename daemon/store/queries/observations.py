@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import threading
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from daemon.store.connection import Connection
@@ -29,14 +32,83 @@ _FIRST = """SELECT utc_ns, monotonic_ns, kernel_boot_id FROM observations JOIN b
 _FIXES = f"""SELECT fixes.* FROM calibration_sessions AS session CROSS JOIN boots CROSS JOIN fixes
     WHERE session.id = ?1 AND station = ?2
         AND {since("fixes.", ("session.started_boot_id", "session.started_monotonic_ns"))}
-        AND fixes.id >= coalesce((SELECT max(fix_id) FROM observations JOIN fixes AS used ON used.id = fix_id
-            WHERE session_id = ?1 AND excluded IS NULL AND used.station = ?2), 0)
+        AND fixes.id >= coalesce((SELECT fix_id FROM observations AS o CROSS JOIN fixes AS used ON used.id = fix_id
+            WHERE session_id = ?1 AND excluded IS NULL AND used.station = ?2
+            ORDER BY o.boot_id DESC, o.monotonic_ns DESC LIMIT 1), 0)
     ORDER BY fixes.id"""
 
-# Each station's oldest fix that is of the prism, as far as is known, and contains a prism constant.
-_FIRST_CONSTANTS = """SELECT fixes.station, fixes.prism_constant_mm, min(observations.id) AS oldest
-    FROM observations JOIN fixes ON fixes.id = fix_id
-    WHERE session_id = ? AND prism_constant_mm IS NOT NULL AND excluded IS NULL GROUP BY station"""
+# Each station's oldest fix that is of the prism, as far as is known, and contains a prism constant. A station that
+# transmits constants does so from its first fix on, so the rest of a long session is not read.
+_FIRST_CONSTANTS = """SELECT fixes.station, fixes.prism_constant_mm, min(first.id) AS oldest
+    FROM (SELECT id, fix_id FROM observations WHERE session_id = ? AND excluded IS NULL
+        ORDER BY boot_id, monotonic_ns LIMIT 10000) AS first CROSS JOIN fixes ON fixes.id = first.fix_id
+    WHERE prism_constant_mm IS NOT NULL GROUP BY station"""
+# A session's observations: all of them by the index, or with NOT INDEXED the newest by their numbers.
+TOTALS = """SELECT max(id) AS last, count(*) FILTER (WHERE excluded IS NULL) AS used, min(boot_id) AS first_boot,
+        max(boot_id) AS last_boot, min(utc_ns - monotonic_ns) AS least_ns, max(utc_ns - monotonic_ns) AS most_ns
+    FROM observations {} WHERE session_id = ? AND id > ?"""
+POSES = """SELECT DISTINCT pose FROM observations {} WHERE session_id = ? AND id > ? AND id <= ?
+        AND excluded IS NULL AND pose IS NOT NULL"""
+EXCLUDED = """SELECT excluded AS reason, count(*) AS n FROM observations {} WHERE session_id = ? AND id > ? AND id <= ?
+        AND excluded IS NOT NULL GROUP BY excluded"""
+
+
+Clock = tuple[int, int, int, int]
+"""First and last boot of some instants; the least and the largest difference of UTC and monotonic time, ns."""
+
+
+@dataclass(frozen=True)
+class Tally:
+    """Counts of a session's observations.
+
+    Attributes:
+        session_id: the session.
+        through: number of the newest observation that is counted.
+        used: number of observations that calibration may use.
+        poses: their poses.
+        excluded: reason -> number of observations that calibration must not use.
+        clock: the clocks at all observations; None without any.
+        steps: steps of the computer's clock, by what the clocks showed; filled by the summary of the session.
+    """
+
+    session_id: str
+    through: int = 0
+    used: int = 0
+    poses: frozenset[str] = frozenset()
+    excluded: Mapping[str, int] = field(default_factory=dict)
+    clock: Clock | None = None
+    steps: dict[object, list[dict[str, Any]]] = field(default_factory=dict)
+
+    def clock_with(self, other: Sequence[int]) -> Clock:
+        """Return the clocks at all observations and at other instants."""
+        clock = self.clock or other
+        return min(clock[0], other[0]), max(clock[1], other[1]), min(clock[2], other[2]), max(clock[3], other[3])
+
+
+def tally_of(source: RowSource, session_id: str, before: Tally | None = None) -> Tally:
+    """Count the observations of a session.
+
+    Args:
+        source: the store.
+        session_id: the session.
+        before: an earlier tally of the session; only observations stored since are read.
+    """
+    tally = before or Tally(session_id)
+    how = "NOT INDEXED" if tally.through else ""
+    (found,) = source.rows(TOTALS.format(how), (session_id, tally.through))
+    last, used, *clock = found.values()
+    if last is None:
+        return tally
+    added = session_id, tally.through, last
+    excluded = Counter({row["reason"]: row["n"] for row in source.rows(EXCLUDED.format(how), added)})
+    return replace(
+        tally,
+        through=last,
+        used=tally.used + used,
+        poses=tally.poses.union(row["pose"] for row in source.rows(POSES.format(how), added)),
+        excluded=Counter(tally.excluded) + excluded,
+        clock=tally.clock_with(clock),
+    )
 
 
 class ObservationTable:
@@ -48,6 +120,28 @@ class ObservationTable:
 
     def __init__(self, store: Connection) -> None:
         self._store = store
+        self._counting = threading.Lock()
+        self._changes = 0  # number of changes of stored exclusions; a tally from before such a change is not extended
+        self._tally: tuple[int, Tally] | None = None
+
+    def tally(self, source: RowSource, session_id: str) -> Tally:
+        """Count the observations of the newest session; those counted by an earlier call are not read again.
+
+        Exclusions of stored observations must be changed through this table.
+
+        Args:
+            source: the store.
+            session_id: the session that is open or has just ended.
+        """
+        with self._counting:
+            changes, known = self._changes, self._tally
+            is_known = known is not None and known[0] == changes and known[1].session_id == session_id
+            tally = tally_of(source, session_id, known[1] if known is not None and is_known else None)
+            self._tally = changes, tally
+        return tally
+
+    def _has_excluded(self) -> None:
+        self._changes += 1
 
     def add(self, fix_id: int | None, measured: Stamp, **columns: object) -> None:
         """Add the observation of a fix."""
@@ -65,11 +159,13 @@ class ObservationTable:
             boot = self._store.boot_row(newest)
             rows = [(excluded, session_id, boot, at_ns) for at_ns, excluded in exclusions.items()]
             db.conn.executemany(_EXCLUDE, rows)
+            self._store.once_committed(self._has_excluded)
 
     def exclude_near(self, session_id: str, point_mm: Sequence[float], radius_mm: float) -> None:
         """Exclude the observations of a session that lie near a control point and are not excluded yet."""
         with self._store.transaction() as db:
             db.conn.execute(_EXCLUDE_NEAR, (session_id, *point_mm, radius_mm))
+            self._store.once_committed(self._has_excluded)
 
 
 # ---- for the writing connection and for readers ----------------------------------------------------------------------

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
 from daemon.host.time_service import ClockState
 from daemon.store.connection import Connection
 from daemon.store.errors import NotInStoreError
+from daemon.store.places import between
 from daemon.store.queries.decoding import OLDEST_WAITING
+from daemon.store.queries.observations import Tally, tally_of
 from daemon.store.queries.zeros import lost_zeros, preset_jumps
 from daemon.store.rows import RowSource, marks
 from daemon.store.views import in_session
@@ -29,31 +31,28 @@ _SUMMARY = """SELECT id, rig, setup_id AS setup, prism, operator, caller_user AS
         accepted_caller_user AS accepted_user,
         (SELECT state = 'moved' FROM station_setups WHERE station_setups.id = setup_id) AS setup_moved
     FROM calibration_sessions WHERE id = ?"""
-_COUNTS = """SELECT count(*) FILTER (WHERE excluded IS NULL) AS observations,
-        count(DISTINCT pose) FILTER (WHERE excluded IS NULL) AS poses FROM observations WHERE session_id = ?"""
-_EXCLUDED = """SELECT excluded AS reason, count(*) AS n FROM observations
-    WHERE session_id = ? AND excluded IS NOT NULL GROUP BY excluded ORDER BY n DESC, reason"""
 _SHOTS = "SELECT name AS point, phase, misclosure_mm FROM control_shots WHERE session_id = ? ORDER BY id"
-_INSTANTS = """WITH instants AS (
-        SELECT boot_id, monotonic_ns, utc_ns, 0 AS is_before FROM observations WHERE session_id = ?1
-        UNION ALL SELECT boot_id, monotonic_ns, utc_ns, 0 FROM control_shots WHERE session_id = ?1
+_OTHER_INSTANTS = """SELECT boot_id, monotonic_ns, utc_ns, 0 AS is_before FROM control_shots WHERE session_id = ?1
         UNION ALL SELECT started_boot_id, started_monotonic_ns, started_utc_ns, 0 FROM calibration_sessions
             WHERE id = ?1
         UNION ALL SELECT ended_boot_id, ended_monotonic_ns, ended_utc_ns, 0 FROM calibration_sessions
             WHERE id = ?1 AND ended_utc_ns IS NOT NULL
         UNION ALL SELECT * FROM (SELECT ended_boot_id, ended_monotonic_ns, ended_utc_ns, 1 FROM calibration_sessions
             WHERE ended_utc_ns IS NOT NULL AND rowid < (SELECT rowid FROM calibration_sessions WHERE id = ?1)
-            ORDER BY rowid DESC LIMIT 1))"""
+            ORDER BY rowid DESC LIMIT 1)"""
 # Prefixes of the reason why a session is not used: it was recorded with a different rig file, or before a joint's zero
 # was lost. Stored reasons are compared with these prefixes, so they must not change.
 OTHER_RIG_FILE = "it was recorded with another rig file: "
 ZERO_LOST = "an encoder has jumped since, and nobody has checked its zero: "
 # Within a boot both clocks run at the same rate, whatever NTP does, so their difference changes only when the clock is
 # set. A later boot must not show an earlier time. For the time since the end of the previous session only backward
-# steps count, because a computer that was suspended is ahead. The first query is cheap and nearly always sufficient.
-_MAY_HAVE_STEPPED = f"""{_INSTANTS} SELECT min(boot_id) < max(boot_id)
-        OR max(utc_ns - monotonic_ns) - min(utc_ns - monotonic_ns) >= {CLOCK_STEP_NS} AS maybe FROM instants"""
-_CLOCK_STEPS = f"""{_INSTANTS},
+# steps count, because a computer that was suspended is ahead. The first query is cheap, and nearly always sufficient
+# together with the tally of observations.
+_CLOCK_RANGE = f"""SELECT min(boot_id), max(boot_id), min(utc_ns - monotonic_ns), max(utc_ns - monotonic_ns), count(*)
+    FROM ({_OTHER_INSTANTS})"""
+_CLOCK_STEPS = f"""WITH instants AS (
+        SELECT boot_id, monotonic_ns, utc_ns, 0 AS is_before FROM observations WHERE session_id = ?1
+        UNION ALL {_OTHER_INSTANTS}),
     pairs AS (SELECT utc_ns, utc_ns - lag(utc_ns) OVER earlier AS passed_ns,
             boot_id = lag(boot_id) OVER earlier AS is_same_boot,
             lag(is_before) OVER earlier AS is_between, monotonic_ns - lag(monotonic_ns) OVER earlier AS true_ns
@@ -65,44 +64,30 @@ _CLOCK_STEPS = f"""{_INSTANTS},
     SELECT utc_ns AS at_utc_ns, step_ns FROM steps WHERE abs(step_ns) >= {CLOCK_STEP_NS}"""
 _CLOCKS = """SELECT phase, synchronized AS is_synchronized, offset_s, max_error_s, source, error
     FROM session_clocks WHERE session_id = ?"""
-# Poses, and poses between two shots of a control point. While the boom moves, each observation counts as one pose.
-_ENCLOSED = """SELECT count(DISTINCT coalesce(o.pose, o.id)) AS poses,
-        count(DISTINCT CASE WHEN EXISTS (SELECT 1 FROM control_shots AS a JOIN control_shots AS b
-                ON b.session_id = a.session_id AND b.name = a.name AND b.phase = 'end'
-            WHERE a.session_id = o.session_id AND a.phase = 'start'
-                AND (a.boot_id, a.monotonic_ns) < (o.boot_id, o.monotonic_ns)
-                AND (o.boot_id, o.monotonic_ns) < (b.boot_id, b.monotonic_ns))
-            THEN coalesce(o.pose, o.id) END) AS enclosed
-    FROM observations AS o WHERE o.session_id = ? AND o.excluded IS NULL"""
-# A pose after the session's first shot, but before any shot of a control point that was shot again at the end.
-_BEFORE_ENCLOSED = """SELECT 1 FROM observations AS o WHERE o.session_id = ?1 AND o.excluded IS NULL
-        AND EXISTS (SELECT 1 FROM control_shots AS s WHERE s.session_id = ?1 AND s.phase = 'start'
-            AND (s.boot_id, s.monotonic_ns) < (o.boot_id, o.monotonic_ns))
-        AND NOT EXISTS (SELECT 1 FROM control_shots AS a JOIN control_shots AS b
-                ON b.session_id = ?1 AND b.name = a.name AND b.phase = 'end'
-            WHERE a.session_id = ?1 AND a.phase = 'start'
-                AND (a.boot_id, a.monotonic_ns) < (o.boot_id, o.monotonic_ns)) LIMIT 1"""
 # Largest distance between shots of a control point with poses in between. Of successive shots without poses in between
 # the last one is used, because it was repeated after a bad shot.
-_MOVED_BETWEEN = """WITH counted AS (SELECT s.id, s.name, s.x_mm, s.y_mm, s.z_mm FROM control_shots AS s
+_MOVED_BETWEEN = f"""WITH counted AS (SELECT s.id, s.name, s.x_mm, s.y_mm, s.z_mm FROM control_shots AS s
         WHERE s.session_id = ?1 AND NOT EXISTS (SELECT 1 FROM control_shots AS c
-            WHERE c.session_id = ?1 AND c.name = s.name AND c.id > s.id AND NOT EXISTS (SELECT 1 FROM observations AS o
-                WHERE o.session_id = ?1 AND o.excluded IS NULL
-                    AND (s.boot_id, s.monotonic_ns) < (o.boot_id, o.monotonic_ns)
-                    AND (o.boot_id, o.monotonic_ns) < (c.boot_id, c.monotonic_ns))))
+            WHERE c.session_id = ?1 AND c.name = s.name AND c.id > s.id AND NOT EXISTS (
+                SELECT 1 FROM boots CROSS JOIN observations AS o WHERE o.session_id = ?1 AND o.excluded IS NULL
+                    AND {between("o.", ("s.boot_id", "s.monotonic_ns + 1"), ("c.boot_id", "c.monotonic_ns - 1"))})))
     SELECT a.name AS point, max((a.x_mm - b.x_mm) * (a.x_mm - b.x_mm) + (a.y_mm - b.y_mm) * (a.y_mm - b.y_mm)
             + (a.z_mm - b.z_mm) * (a.z_mm - b.z_mm)) AS square_mm2
     FROM counted AS a JOIN counted AS b ON b.name = a.name AND b.id > a.id"""
 _BETWEEN = """SELECT 1 FROM observations AS o JOIN control_shots AS c ON c.session_id = o.session_id AND c.name = ?
     WHERE o.session_id = ? AND o.excluded IS NULL
         AND (o.boot_id, o.monotonic_ns) > (c.boot_id, c.monotonic_ns) LIMIT 1"""
-# The newest observation of each standstill, by session, from an instant on.
-_STANDSTILLS = """SELECT max(o.id) AS id, o.session_id, o.prism, o.x_mm, o.y_mm, o.z_mm, o.values_json
-    FROM calibration_sessions AS s JOIN observations AS o ON o.session_id = s.id
-    WHERE s.setup_id = ? AND s.rig = ? AND s.state != 'aborted' AND o.excluded IS NULL AND o.pose IS NOT NULL
-        AND coalesce(s.excluded, '') NOT LIKE ?
-        AND (o.boot_id, o.monotonic_ns) >= (?, ?)
-    GROUP BY o.session_id, o.pose ORDER BY id DESC LIMIT 500"""
+# The newest observation of each standstill, by session, from an instant on. The inner query follows the index, newest
+# first, and ends early, however long the sessions are.
+_STANDSTILLS = """SELECT id, session_id, prism, x_mm, y_mm, z_mm, values_json FROM observations WHERE id IN (
+    SELECT max(id) AS newest FROM (SELECT o.id, o.session_id, o.pose
+            FROM calibration_sessions AS s CROSS JOIN observations AS o ON o.session_id = s.id
+            WHERE s.setup_id = ? AND s.rig = ? AND s.state != 'aborted' AND o.excluded IS NULL AND o.pose IS NOT NULL
+                AND coalesce(s.excluded, '') NOT LIKE ?
+                AND (o.boot_id, o.monotonic_ns) >= (?, ?)
+            ORDER BY s.rowid DESC, o.boot_id DESC, o.monotonic_ns DESC LIMIT 50000)
+        GROUP BY session_id, pose ORDER BY newest DESC LIMIT 500)
+    ORDER BY id"""
 # Sessions after the newest used session; later measurements replace earlier ones.
 _UNTRAINED = f"""SELECT id, excluded FROM calibration_sessions
     WHERE rig = ?1 AND state = 'closed' AND excluded IS NOT NULL AND excluded NOT LIKE '{OTHER_RIG_FILE}%'
@@ -119,6 +104,19 @@ _BETWEEN_INSTANTS = f"""{_WITH_RIG} WHERE (started_boot_id, started_monotonic_ns
 _FIXES_MEASURED = f"""SELECT row.* {in_session("links CROSS JOIN v_fixes")} AND row.station = links.name
     ORDER BY row.id"""
 _JOINTS_MEASURED = f"SELECT row.* {in_session('v_joints')} ORDER BY row.boot_id, row.monotonic_ns"
+# When a session last got a fix or a shot, or the end of the run of the daemon in which it did, whichever is later.
+_LAST_MEASURED = """WITH measured AS (SELECT * FROM (
+            SELECT utc_ns, monotonic_ns, boot_id FROM control_shots WHERE session_id = ?1
+            UNION ALL SELECT started_utc_ns, started_monotonic_ns, started_boot_id FROM calibration_sessions
+                WHERE id = ?1
+            UNION ALL SELECT * FROM (SELECT utc_ns, monotonic_ns, boot_id FROM observations WHERE session_id = ?1
+                ORDER BY boot_id DESC, monotonic_ns DESC LIMIT 1))
+        ORDER BY boot_id DESC, monotonic_ns DESC LIMIT 1)
+    SELECT * FROM (SELECT * FROM measured UNION ALL SELECT * FROM (
+            SELECT run.alive_utc_ns, run.alive_monotonic_ns, run.alive_boot_id FROM daemon_runs AS run, measured
+            WHERE (run.started_boot_id, run.started_monotonic_ns) <= (measured.boot_id, measured.monotonic_ns)
+            ORDER BY run.id DESC LIMIT 1))
+    ORDER BY boot_id DESC, monotonic_ns DESC LIMIT 1"""
 _OPEN = """SELECT id, started_utc_ns, started_monotonic_ns, started_boot_id FROM calibration_sessions
     WHERE rig = ? AND state = 'open' ORDER BY rowid DESC LIMIT 1"""
 
@@ -160,14 +158,18 @@ class SessionTable:
         taken = self.ids()
         return next(name for n in itertools.count(len(taken) + 1) if (name := f"s{n:03d}-{prism}") not in taken)
 
-    def summary(self, session_id: str) -> dict[str, Any]:
+    def summary(self, session_id: str, count: Callable[[RowSource, str], Tally] = tally_of) -> dict[str, Any]:
         """Return a summary of one session: its observations, exclusions with reasons, and whether calibration uses it.
+
+        Args:
+            session_id: the session.
+            count: counts its observations.
 
         Raises:
             NotInStoreError: there is no such session.
         """
         with self._store.reader() as reader:
-            return _summary(reader, session_id)
+            return _summary(reader, session_id, count)
 
     def all(self) -> list[dict[str, Any]]:
         """Return all summaries, oldest first, read on a separate connection so that the writing one does not wait."""
@@ -178,6 +180,17 @@ class SessionTable:
     def unfinished(self) -> list[dict[str, Any]]:
         """Return the sessions that may still get fixes: open ones, and those whose captures are not all decoded."""
         return self._store.rows(_UNFINISHED)
+
+    def follower(self, session_id: str) -> str | None:
+        """Return the session that was started next after one, whatever its rig; None if there is none."""
+        sql = """SELECT id FROM calibration_sessions
+            WHERE rowid > (SELECT rowid FROM calibration_sessions WHERE id = ?) ORDER BY rowid LIMIT 1"""
+        return next((row["id"] for row in self._store.rows(sql, (session_id,))), None)
+
+    def last_measured(self, session_id: str) -> Stamp:
+        """Return the end of the last run of the daemon that measured in a session."""
+        (row,) = self._store.rows(_LAST_MEASURED, (session_id,))
+        return self._store.stamp(row)
 
     def open_session(self) -> OpenSessionRow | None:
         """Return the rig's open session; None without one."""
@@ -305,15 +318,6 @@ class SessionTable:
         (found,) = self._store.rows(_MOVED_BETWEEN, (session_id,))
         return None if found["point"] is None else (found["point"], math.sqrt(found["square_mm2"]))
 
-    def has_poses_before_enclosed(self, session_id: str) -> bool:
-        """Return True if a pose follows the first shot but precedes all shots of points shot again at the end."""
-        return bool(self._store.rows(_BEFORE_ENCLOSED, (session_id,)))
-
-    def count_poses(self, session_id: str) -> tuple[int, int]:
-        """Return the number of a session's poses, and of those between two shots of a control point."""
-        (found,) = self._store.rows(_ENCLOSED, (session_id,))
-        return found["poses"], found["enclosed"]
-
     # ---- their prism ------------------------------------------------------------------------------------------------
 
     def standstill_observations(self, setup_id: str, since: Stamp | None) -> list[dict[str, Any]]:
@@ -326,10 +330,10 @@ class SessionTable:
             since: earlier observations are left out; None for no limit.
 
         Returns:
-            session_id, prism, x_mm, y_mm, z_mm and values_json of each, at most 500.
+            session_id, prism, x_mm, y_mm, z_mm and values_json of each, at most 500, among the newest 50,000 fixes.
         """
         first = (0, 0) if since is None else self._store.order(since)
-        return self._store.rows(_STANDSTILLS, (setup_id, self._rig, f"{OTHER_RIG_FILE}%", *first))[::-1]
+        return self._store.rows(_STANDSTILLS, (setup_id, self._rig, f"{OTHER_RIG_FILE}%", *first))
 
     def add_confirmation(self, session_id: str, at: Stamp, **columns: object) -> None:
         """Add a confirmation that the session's stations are on its prism: with `operator` and caller, or `turning`."""
@@ -392,20 +396,21 @@ def fixes_measured(source: RowSource, session_id: str) -> Iterator[dict[str, Any
     return iter(source.rows(_FIXES_MEASURED, (session_id,)))
 
 
-def _summary(source: RowSource, session_id: str) -> dict[str, Any]:
+def _summary(source: RowSource, session_id: str, count: Callable[[RowSource, str], Tally] = tally_of) -> dict[str, Any]:
     found = list(source.rows(_SUMMARY, (session_id,)))
     if not found:
         raise _unknown(session_id)
     row = found[0]
     accepted = {key: row.pop(f"accepted_{key}") for key in ("despite", "by", "user", "utc_ns")}
-    (counts,) = source.rows(_COUNTS, (session_id,))
-    steps = _clock_steps(source, session_id)
+    tally = count(source, session_id)
+    steps = _clock_steps(source, tally)
     return {
         **row,
-        **counts,
+        "observations": tally.used,
+        "poses": len(tally.poses),
         "setup_moved": bool(row["setup_moved"]),
         "accepted": accepted if accepted["despite"] is not None else None,
-        "excluded": {e["reason"]: e["n"] for e in source.rows(_EXCLUDED, (session_id,))},
+        "excluded": dict(sorted(tally.excluded.items(), key=lambda item: (-item[1], item[0]))),
         "control_shots": list(source.rows(_SHOTS, (session_id,))),
         "clock": _clocks(source, session_id),
         "clock_steps": steps,
@@ -422,13 +427,18 @@ def _clocks(source: RowSource, session_id: str) -> dict[str, dict[str, Any] | No
     return found
 
 
-def _clock_steps(source: RowSource, session_id: str) -> list[dict[str, Any]]:
+def _clock_steps(source: RowSource, tally: Tally) -> list[dict[str, Any]]:
     """Return when and by how much the computer's clock was set during a session, or set back before it."""
-    (found,) = source.rows(_MAY_HAVE_STEPPED, (session_id,))
-    if not found["maybe"]:
+    (found,) = source.rows(_CLOCK_RANGE, (tally.session_id,))
+    *clock, instants = found.values()
+    first, last, least_ns, most_ns = seen = tally.clock_with(clock)
+    if first == last and most_ns - least_ns < CLOCK_STEP_NS:
         return []
-    steps = source.rows(_CLOCK_STEPS, (session_id,))
-    return [{"at_utc_ns": step["at_utc_ns"], "step_s": step["step_ns"] / NS_PER_S} for step in steps]
+    if (seen, instants) not in tally.steps:  # computed again only when the clocks show something new
+        steps = source.rows(_CLOCK_STEPS, (tally.session_id,))
+        found_now = [{"at_utc_ns": step["at_utc_ns"], "step_s": step["step_ns"] / NS_PER_S} for step in steps]
+        tally.steps[seen, instants] = found_now
+    return tally.steps[seen, instants]
 
 
 def _unknown(session_id: str) -> NotInStoreError:

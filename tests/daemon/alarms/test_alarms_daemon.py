@@ -21,11 +21,14 @@ from daemon.config.config import parse_config
 from daemon.control.protocol import request
 from daemon.rig_files import load_rig
 from daemon.service import Daemon
+from daemon.sessions.prisms.standstill_places import ELSEWHERE
 from daemon.store import Store
 from tests.daemon.acquisition.test_clock_watch import SetClock
 from tests.daemon.support.acquisition import wait_until
 from tests.daemon.support.daemon_process import DaemonProcess
 from tests.daemon.support.idle_daemon import running as run_daemon
+from tests.daemon.support.sessions import STEP_S
+from tests.daemon.support.sessions import Rig as SessionRig
 from tests.daemon.support.store import table
 
 CONFIG = """rig = "swdt82"
@@ -150,3 +153,31 @@ def rigcal(*arguments: str) -> subprocess.CompletedProcess[str]:
         check=False,
         env=environment,
     )
+
+
+def test_fixes_elsewhere_are_an_alarm_however_old_the_newest_fix_is_until_one_is_used(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig = SessionRig(tmp_path / "sessions.sqlite")
+    monkeypatch.setattr(rig.clock, "real_seconds", lambda seconds: seconds)  # fixes age as this clock goes
+    config = parse_config(CONFIG, tmp_path / "rigcal.toml")
+    store = Store(config.store_path)
+    daemon = Daemon(config, store, replace(live(config, load_rig("swdt82")), clock=SetClock()))
+    monkeypatch.setattr(daemon, "_sessions", rig.keeper)
+    newest = daemon._evidence()["newest_excluded"]
+    rig.say("setup_new", id="S1")
+    rig.say("start", prism="r")
+    rig.live(3)
+    place_mm = rig.target_mm
+    rig.target_mm = (place_mm[0] + 200.0, *place_mm[1:])
+    rig.live(STEP_S)
+    rig.steps_of_fix = 10**6
+    for _ in range(3):
+        rig.live(12)
+        assert str(newest()).startswith(ELSEWHERE)
+    rig.steps_of_fix, rig.target_mm = 1, place_mm
+    rig.live(1)
+    assert newest() is None
+    rig.store.close()
+    daemon.close()
+    store.close()

@@ -75,6 +75,19 @@ def test_a_boom_that_has_just_come_to_a_stand_is_not_said_to_move(
     assert stood_s[-1] > 0.5
 
 
+def test_fixes_that_do_not_count_are_told_however_late_they_arrive(
+    rig: WatchedRig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(rig.clock, "real_seconds", lambda seconds: seconds)  # fixes age as this clock goes
+    rig.at_a_pose(plan=[POSE] * 6)
+    rig.jump()
+    rig.live(6.0)
+    rig.steps_of_fix = 10**6  # the next fix is still on its way
+    rig.live(2.0)
+    (warning,) = rig.warnings()
+    assert "theta1 jumped" in warning
+
+
 def test_nothing_is_told_of_fixes_while_poses_are_chosen(rig: WatchedRig) -> None:
     rig.at_a_pose(poses=6)
     rig.jump()

@@ -11,9 +11,10 @@ from calibration.errors import DataError
 from calibration.rig.description import Rig as Machine
 from calibration.rig.description import parse_rig
 from daemon.commands import CommandError
-from daemon.rig_files import misreading
+from daemon.rig_files import load_rig, misreading
 from daemon.sessions.session_data import sessions_csv
 from daemon.store.queries.sessions import SessionTable
+from daemon.store.upkeep.retention import LAST, free_stretches
 from rigcal.store_api import open_store
 from tests.daemon.support.rig_files import ANOTHER_FACTOR, ANOTHER_LENGTH, ANOTHER_ZERO, L2, decoded_rig, own_rig
 from tests.daemon.support.sessions import SOURCE, Rig, controlled
@@ -146,3 +147,57 @@ def test_data_of_two_rig_files_are_refused_wherever_they_are_read(session_rig: R
         rig, rows = store.training_data([before])
         assert "theta8" in rig.joint_names
         assert len(rows) > 0
+
+
+RENAMED = ('name = "swdt82"', 'name = "boom7"')
+
+
+def test_a_session_left_open_is_closed_when_the_rig_is_renamed(session_rig: Rig) -> None:
+    name = str(session_rig.say("start", prism="r")["id"])
+    session_rig.shoot("cp1", (9000.0, 500.0, 2000.0))
+    session_rig.live(2)
+    session_rig.shoot("cp1", (9000.0, 500.0, 2000.0))
+    change_rig_file(session_rig, other(*RENAMED))
+    closed = session_rig.say("show", id=name)
+    assert closed["state"] == "closed"
+    assert closed["note"] == "closed by rigcal: the rig was changed from swdt82 to boom7 while it was open"
+    assert closed["not_used"] is None, "its control point shows that the station stood still"
+    session_rig.clock.advance(3600)
+    assert [end for _, end in free_stretches(session_rig.store)][-1] == LAST, "what is captured from now on may go"
+    session_rig.say("start", prism="b")
+    session_rig.live(2)
+    session_rig.say("stop")
+    change_rig_file(session_rig, SOURCE.rig)
+    assert session_rig.keeper.open_session() is None, "it does not go on with a station that has been elsewhere"
+    assert used(session_rig) == [name]
+
+
+def test_a_session_of_a_different_machine_left_open_is_closed_and_can_be_accepted_once_that_is_back(
+    session_rig: Rig,
+) -> None:
+    name = str(session_rig.say("start", prism="r")["id"])
+    session_rig.live(2)
+    change_rig_file(session_rig, load_rig("ur10").rig)
+    assert "another rig file" in session_rig.say("show", id=name)["not_used"]
+    change_rig_file(session_rig, SOURCE.rig)
+    session_rig.say("accept", id=name)
+    assert used(session_rig) == [name]
+
+
+def test_a_session_that_an_older_version_left_open_ends_with_the_run_that_measured_in_it(session_rig: Rig) -> None:
+    store, clock = session_rig.store, session_rig.clock
+    name = str(session_rig.say("start", prism="r")["id"])
+    session_rig.live(2)
+    store.note_alive(clock.now())
+    measured = clock.now()
+    clock.advance(30 * 86_400)  # a month with another rig
+    store.begin_run(clock.now())
+    row = {"id": "later", "rig": "boom7", "prism": "b", "operator": "", "kind": "static_poses", "state": "closed"}
+    store.insert(
+        "calibration_sessions", row | store.instant(clock.now(), "started_") | store.instant(clock.now(), "ended_")
+    )
+    change_rig_file(session_rig, SOURCE.rig)
+    closed = session_rig.say("show", id=name)
+    assert (closed["state"], closed["ended_utc_ns"]) == ("closed", measured.utc_ns)
+    assert closed["not_used"] == "it was still open when session later was started"
+    assert len([*free_stretches(store)]) == 3, "before, between and after the two"

@@ -92,7 +92,9 @@ def test_the_store_holds_one_open_session_of_a_rig(session_rig: Rig) -> None:
     session_rig.store.insert("calibration_sessions", row | {"id": "another session_rig's", "rig": "ur10"})
 
 
-def test_of_the_open_sessions_of_an_older_store_the_newest_goes_on_and_the_others_say_why_not(tmp_path: Path) -> None:
+def test_of_the_open_sessions_of_an_older_store_none_goes_on_and_each_says_why(
+    tmp_path: Path,
+) -> None:
     old = Database(tmp_path / "rigcal.sqlite")
     MIGRATIONS.apply(old, stop_before="m008_one_open_session")
     with old.atomic():
@@ -116,13 +118,13 @@ def test_of_the_open_sessions_of_an_older_store_the_newest_goes_on_and_the_other
     old.close()
     rig = Rig(tmp_path / "rigcal.sqlite")
     a, b, x = rig.say("list")
-    assert (a["state"], b["state"], x["state"]) == ("aborted", "open", "open")
+    assert (a["state"], b["state"], x["state"]) == ("aborted", "closed", "closed")
     assert a["note"].startswith("windy; aborted by rigcal: it was still open when session b was started")
     assert a["ended_utc_ns"] == b["started_utc_ns"]
-    assert b["note"] == ""
-    went_on = rig.keeper.open_session()
-    assert went_on is not None
-    assert went_on["id"] == "b"
+    assert b["note"] == "closed by rigcal: session x was started while it was open"
+    assert b["not_used"] == "it was still open when session x was started"
+    assert x["note"] == "closed by rigcal: the rig was changed from ur10 to swdt82 while it was open"
+    assert rig.keeper.open_session() is None
     rig.store.close()
 
 
