@@ -25,6 +25,10 @@ from drivers.stall_detector import CLOCK_WAS_SET, NOT_READ_IN_TIME, LateReport, 
 
 POLL_S = 0.05  # longest delay until a stop or a set-up request is noticed
 LOSS_CHECK_NS = NS_PER_S
+QUEUE_FULL = (
+    "the transmit queue is full, so frames are not sent: check that other nodes are powered and use the same bit rate, "
+    "and that the bus is not overloaded"
+)
 
 Emit = Callable[[Capture | DeviceEvent | Gap], None]
 
@@ -176,11 +180,12 @@ class CanLink:
                         backoff.reset()
                     if last_reads.are_over(is_emptied=read.batch.is_last):
                         return
-                    if last_reads.have_begun():
-                        read = session.read(LAST_READ_S)
-                    else:
-                        session.serve(self._swap_requests([]), self._take_published())
-                        read = session.read(session.patience_s())
+                    if not last_reads.have_begun():
+                        try:
+                            session.serve(self._swap_requests([]), self._take_published())
+                        except LinkError as error:  # what the port has received is still read
+                            last_reads.begin(error)
+                    read = session.read(LAST_READ_S if last_reads.have_begun() else session.patience_s())
             finally:
                 cause = "rigcal was stopped" if stop.is_set() else "the link was lost"
                 session.close(self._swap_requests(None), cause)
@@ -235,6 +240,7 @@ class _Session:
         self._port = port
         self._emit = emit
         self._setup = SetupRunner()
+        self._unsent = self._unsent_checked = 0  # frames not sent since the transmit queue became full
         self._losses: dict[str, int] = {}
         self._stamps = ReceiveStamps(clock, opened)
         began = clock.of_host(opened)
@@ -304,6 +310,8 @@ class _Session:
     def serve(self, requests: Iterable[NodeSetup], published: Iterable[Frame]) -> None:
         """Send all frames that are due, and report lost frames.
 
+        Frames that find the transmit queue full are not sent later: they would be outdated. Set-ups are cancelled then.
+
         Args:
             requests: set-ups requested since the last call.
             published: own frames to send.
@@ -320,12 +328,15 @@ class _Session:
         if self._setup.is_active:
             self._setup.advance(self._clock.now())
         # Even if no set-up is active any more, the last node's start command and event may be left to send
-        for frame in self._setup.take_frames():
-            self._send(frame)
+        if not all(self._send(frame) for frame in self._setup.take_frames()):
+            self._setup.abort(self._clock.now(), "the transmit queue was full")
         self._emit_setup_events()
         if monotonic_ns >= self._check_losses_ns:
             self._check_losses_ns = monotonic_ns + LOSS_CHECK_NS
             self._report_losses()
+            if self._unsent == self._unsent_checked:
+                self._end_unsent()
+            self._unsent_checked = self._unsent
             self.read_until = self._emptied
 
     def patience_s(self) -> float:
@@ -341,6 +352,7 @@ class _Session:
         """Report everything that is left when the bus is closed because of `cause`; cancel set-ups."""
         self._emit_sent(self._clock.now())
         self._report_losses()
+        self._end_unsent()
         self.read_until = self._emptied
         for item in self._late.end(self._clock.now()):
             self._emit(item)
@@ -349,11 +361,24 @@ class _Session:
         self._setup.abort(self._clock.now(), cause)
         self._emit_setup_events()
 
-    def _send(self, frame: Frame) -> None:
+    def _send(self, frame: Frame) -> bool:
+        """Send a frame; return False if the transmit queue is full, which is reported once."""
         self._permission.check(frame)
         stamp = self._clock.now()
-        self._port.send(frame)
+        if not self._port.send(frame):
+            if not self._unsent:
+                self._emit(DeviceEvent(self._name, stamp, EventKind.WARNING, f"{self._name}: {QUEUE_FULL}"))
+            self._unsent += 1
+            return False
         self._sent.append(CanCapture(self._name, stamp, frame.arbitration_id, frame.data, is_transmitted=True))
+        return True
+
+    def _end_unsent(self) -> None:
+        """Withdraw the warning that the transmit queue is full."""
+        if self._unsent:
+            text = f"{self._name}: {self._unsent} frames were not sent while the transmit queue was full"
+            self._emit(DeviceEvent(self._name, self._clock.now(), EventKind.WARNING, text, 0))
+        self._unsent = 0
 
     def _emit_setup_events(self) -> None:
         for event in self._setup.take_events():

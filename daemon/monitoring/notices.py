@@ -1,4 +1,7 @@
-"""Notices: alarms that are sent from the machine, by a separate thread that nothing waits for."""
+"""Notices: alarms that are sent from the machine, by a separate thread that nothing waits for.
+
+A second thread writes them to the store, so that they are also sent while a write hangs.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +12,7 @@ from typing import Any
 
 from daemon.commands import CommandError, current_caller
 from daemon.config.sections import NotifySection
+from daemon.host.worker_thread import WorkerThread
 from daemon.monitoring.delivery import Command, Target, Webhook
 from daemon.monitoring.notice import Notice
 from daemon.monitoring.outbox import USUAL, Outbox, Pace
@@ -54,15 +58,16 @@ class Notices:
         self._inbox: list[Notice] = []
         self._changed = threading.Condition()
         self._is_stopping = False
-        self._is_told = False  # whether it was logged that the store cannot be written
         self._fault = ""  # last error of the thread itself
         self._thread = threading.Thread(target=self._run, name="notices", daemon=True)
+        self._writer = _Writer(self._outboxes)
         self._status = [outbox.status() for outbox in self._outboxes]
 
     def start(self) -> None:
         """Start to send."""
         if self._outboxes:
             self._thread.start()
+            self._writer.start()
 
     def stop(self) -> None:
         """Stop sending; pending notices stay in the store for the next start."""
@@ -73,6 +78,7 @@ class Notices:
             outbox.target.cancel()
         if self._thread.is_alive():
             self._thread.join(STOP_S)
+        self._writer.stop()
 
     def take(self, notice: Notice) -> None:
         """Queue a notice; from any thread, without waiting."""
@@ -128,7 +134,7 @@ class Notices:
         for outbox in self._outboxes:
             if outbox.due_in_s() == 0.0 and not self._is_stopping:
                 outbox.send()
-        self._write()
+        self._writer.write_soon()
         self._status = [outbox.status() for outbox in self._outboxes]
 
     def _take_in(self) -> None:
@@ -139,14 +145,39 @@ class Notices:
                 outbox.add(notice)
         with self._changed:
             del self._inbox[: len(taken)]
-        self._write()
+        self._writer.write_soon()
 
     def _patience_s(self) -> float | None:
         """Return how long the thread may sleep, seconds; None to sleep until it is woken."""
-        waits = [due for outbox in self._outboxes if (due := outbox.due_in_s()) is not None]
-        if not all(outbox.is_written for outbox in self._outboxes):
-            waits.append(REWRITE_S)
-        return min(waits, default=None)
+        return min((due for outbox in self._outboxes if (due := outbox.due_in_s()) is not None), default=None)
+
+
+class _Writer(WorkerThread):
+    """Writes the notices of all outboxes to the store; repeats writes that fail."""
+
+    def __init__(self, outboxes: Sequence[Outbox]) -> None:
+        super().__init__("notices-store", STOP_S)
+        self._outboxes = outboxes
+        self._to_write = threading.Event()
+        self._is_told = False  # whether it was logged that the store cannot be written
+
+    def write_soon(self) -> None:
+        """Write all changes soon, without waiting for that."""
+        self._to_write.set()
+
+    def stop(self) -> None:
+        """Write pending changes and end the thread."""
+        self._stopping.set()
+        self._to_write.set()
+        super().stop()
+
+    def _run(self) -> None:
+        is_last = False
+        while not is_last:
+            self._to_write.wait(None if all(outbox.is_written for outbox in self._outboxes) else REWRITE_S)
+            self._to_write.clear()
+            is_last = self._stopping.is_set()  # asked before the write: what is pending at a stop is still written
+            self._write()
 
     def _write(self) -> None:
         try:

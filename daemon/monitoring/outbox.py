@@ -1,11 +1,12 @@
 """Notices for one target: kept in memory and in the store until they are delivered.
 
-If the store cannot be written, notices are still sent, and their rows are written as soon as possible.
+If the store cannot be written or a write hangs, notices are still sent, and their rows are written as soon as possible.
 """
 
 from __future__ import annotations
 
 import logging
+import threading
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
@@ -45,14 +46,15 @@ USUAL = Pace()
 
 @dataclass
 class _Entry:
-    """A notice and its row id in the store, which is None until it is written."""
+    """A notice, its row id in the store (None until it is written), and when it was sent."""
 
     notice: Notice
     row: int | None = None
+    sent: Stamp | None = None
 
 
 class Outbox:
-    """The notices of one target; for use by a single thread.
+    """The notices of one target. One thread adds and sends them, and a second thread may call `write`.
 
     Args:
         target: delivers the notices.
@@ -70,13 +72,13 @@ class Outbox:
         self._table, self._rig, self._clock, self._pace, self._least = table, rig, clock, pace, least
         self._real = SystemClock()  # pauses are in real time; the rig's clock may run at a different rate
         now = clock.now()
+        self._turn = threading.Lock()  # held while entries are moved or changed, never during a write or a delivery
         rows = table.waiting(target.name, now.utc_ns - STALE_NS, WAITING_MAX)
         self._waiting = [_Entry(_notice(row), row["id"]) for row in rows]
         # Alarms whose notices were sent or are pending, and that have not cleared
         self._uncleared = {notice.key: notice for notice in map(_notice, table.uncleared(target.name))}
         self._unlisted = 0
-        self._unwritten: list[tuple[Notice, Stamp]] = []  # sent but not yet in the store
-        self._sent_through: tuple[int, Stamp] | None = None  # sent up to this row; not yet in the store
+        self._unwritten: list[_Entry] = []  # sent, which is not yet in the store
         self._retry_s = pace.first_retry_s
         self._due_ns = self._real.monotonic_ns() if self._waiting else None
         hour_ago_ns = now.utc_ns - round(HOUR_S * NS_PER_S)
@@ -117,10 +119,11 @@ class Outbox:
             if uncleared is None:
                 return
             del self._uncleared[notice.key]
-        self._waiting.append(_Entry(notice))
-        if len(self._waiting) > WAITING_MAX:
-            del self._waiting[0]
-            self._unlisted += 1
+        with self._turn:
+            self._waiting.append(_Entry(notice))
+            if len(self._waiting) > WAITING_MAX:
+                del self._waiting[0]
+                self._unlisted += 1
         if self._due_ns is None:
             self._due_ns = self._real.monotonic_ns() + round(self._pace.gather_s * NS_PER_S)
 
@@ -129,26 +132,30 @@ class Outbox:
     @property
     def is_written(self) -> bool:
         """True if all changes are in the store."""
-        has_new = any(entry.row is None for entry in self._waiting)
-        return not (has_new or self._unwritten or self._sent_through)
+        return not self._changes()
 
     def write(self) -> None:
         """Write all changes to the store; sqlite3.Error or StoreError if it cannot be written."""
-        if self.is_written:
+        changes = self._changes()
+        if not changes:
             return
         with self._table.transaction():
+            for sent, row in {sent: row for _, row, sent in changes if row is not None and sent is not None}.items():
+                self._table.mark_sent(self.target.name, row, sent)
             rows = [
-                self._table.add(self.target.name, **vars(entry.notice)) if entry.row is None else entry.row
-                for entry in self._waiting
+                self._table.add(self.target.name, sent=sent, **vars(entry.notice)) if row is None else row
+                for entry, row, sent in changes
             ]
-            for notice, sent in self._unwritten:
-                self._table.add(self.target.name, sent=sent, **vars(notice))
-            if self._sent_through is not None:
-                self._table.mark_sent(self.target.name, *self._sent_through)
-        for entry, row in zip(self._waiting, rows, strict=True):
-            entry.row = row
-        self._unwritten.clear()
-        self._sent_through = None
+        with self._turn:
+            for (entry, _, _), row in zip(changes, rows, strict=True):
+                entry.row = row
+            del self._unwritten[: sum(sent is not None for _, _, sent in changes)]
+
+    def _changes(self) -> list[tuple[_Entry, int | None, Stamp | None]]:
+        """Return the entries that the store lacks, oldest first, as they are now: the entry, its row and when sent."""
+        with self._turn:
+            entries = [*self._unwritten, *self._waiting]
+            return [(one, one.row, one.sent) for one in entries if one.row is None or one.sent is not None]
 
     def due_in_s(self) -> float | None:
         """Return the seconds until the next delivery attempt; None if nothing is pending."""
@@ -185,12 +192,12 @@ class Outbox:
             return
         now = self._clock.now()
         log.info("%d notices were delivered by %s", len(notices) + self._unlisted, self.target.name)
-        self._unwritten += [(entry.notice, now) for entry in self._waiting if entry.row is None]
-        written = [entry.row for entry in self._waiting if entry.row is not None]
-        if written:
-            self._sent_through = max(written), now
-        self._waiting.clear()
-        self._unlisted = 0
+        with self._turn:
+            for entry in self._waiting:
+                entry.sent = now
+            self._unwritten += self._waiting
+            self._waiting = []
+            self._unlisted = 0
         self._due_ns, self._error = None, None
         self._retry_s = self._pace.first_retry_s
         self._sent_ns.append(self._real.monotonic_ns())

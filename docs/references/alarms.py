@@ -32,9 +32,10 @@ Each target receives a notice when an alarm is raised, becomes critical or ends,
 when `[notify]` is added. Notices within 3 s are combined into one message. At most 20 messages an hour are sent;
 further notices wait and are sent in one message. A failed delivery is retried after 10 s, then with the delay doubled
 each time, up to 15 min. Notices are rows of the store's table `notices` until they are delivered, so a restart loses
-none. The next start does not send a notice that has waited for more than 7 days. `rigcal alarms --send-test` sends a
-test notice. Nothing is sent when a log is replayed. The address may contain a secret, so only root and the service's
-group should be able to read the configuration; log and status show only the host.
+none. They are also sent while the store cannot be written; a restart may then repeat one. The next start does not send
+a notice that has waited for more than 7 days. `rigcal alarms --send-test` sends a test notice. Nothing is sent when a
+log is replayed. The address may contain a secret, so only root and the service's group should be able to read the
+configuration; log and status show only the host.
 
 The webhook receives a POST request with a JSON object: `text` (the whole message, as chat services show it),
 `subject`, `rig`, `host`, `notices` (`event` raised, cleared or test, `kind`, `subject`, `severity`, `text`, `remedy`,

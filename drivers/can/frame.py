@@ -92,6 +92,15 @@ _SLCAN_ERRORS = {
 }
 
 
+def slcan_line(frame: Frame) -> bytes:
+    """Return the line that makes an slcan adapter send a frame."""
+    letter, data = ("r", "") if frame.is_remote else ("t", frame.data.hex().upper())
+    identifier = (
+        f"{letter.upper()}{frame.arbitration_id:08X}" if frame.is_extended else f"{letter}{frame.arbitration_id:03X}"
+    )
+    return f"{identifier}{len(frame.data)}{data}\r".encode("ascii")
+
+
 class SlcanLines:
     """Splits an adapter's bytes into lines and parses these into frames. Pure.
 

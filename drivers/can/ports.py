@@ -1,5 +1,7 @@
 """Ports to a CAN bus. python-can opens, configures, sends and closes; received frames are read from its descriptor.
 
+A port never waits to send, because frames would not be read in the meantime.
+
 python-can's own `recv` computes its timeout on the wall clock, builds and logs an object for every frame and hides the
 kernel's count of lost frames. A port therefore waits on the file descriptor that `fileno()` returns (duplicated, so
 that each side closes its own) and parses what arrives: SocketCAN's `can_frame`, the datagrams of `udp_multicast`, the
@@ -30,7 +32,7 @@ import can
 from can.interfaces.slcan import slcanBus
 from can.interfaces.virtual import VirtualBus
 
-from drivers.can.frame import DATA_MAX, Frame, SlcanLines, parse_can_frame, parse_multicast
+from drivers.can.frame import DATA_MAX, Frame, SlcanLines, parse_can_frame, parse_multicast, slcan_line
 from drivers.clock import NS_PER_S
 from drivers.errors import LinkError
 from drivers.last_reads import more_may_wait
@@ -39,6 +41,7 @@ Interface = Literal["socketcan", "virtual", "udp_multicast", "slcan"]
 
 ADAPTER_READY_S = 1.2  # wait after opening the port, as some slcan adapters restart then; opening takes under 2 s
 BATCH_MAX = 512  # frames per read, so that a flooded bus cannot keep the loop from its other duties
+CLOSE_WRITE_S = 1.0  # longest wait for an slcan adapter to accept the command that closes its channel
 GATHER_S = 0.005  # frames this soon after the first are read together with it, as each wake-up costs as much as a few
 
 # Linux, include/uapi/asm-generic/socket.h; Python's socket module does not name them
@@ -178,8 +181,8 @@ class CanPort(abc.ABC):
         """Return the descriptor that becomes readable when a frame arrives; LinkError if there is none (`virtual`)."""
         raise LinkError(self._where, "an in-process bus has no descriptor")
 
-    def send(self, frame: Frame) -> None:
-        """Send one frame."""
+    def send(self, frame: Frame) -> bool:
+        """Send one frame without waiting; return False if it was not sent because the transmit queue is full."""
         message = can.Message(
             arbitration_id=frame.arbitration_id,
             data=frame.data,
@@ -189,7 +192,10 @@ class CanPort(abc.ABC):
         try:
             self._send(message)
         except (can.CanError, OSError) as error:
+            if _is_queue_full(error):
+                return False
             raise self._gone(error) from error
+        return True
 
     def losses(self) -> dict[str, int]:
         """Return the number of frames lost since the port was opened, by reason."""
@@ -201,13 +207,19 @@ class CanPort(abc.ABC):
             self._bus.shutdown()
 
     def _send(self, message: can.Message) -> None:
-        self._bus.send(message, timeout=1.0)
+        self._bus.send(message, timeout=0.0)
 
     def _count_lost(self, reason: str, count: int = 1) -> None:
         self._losses[reason] = self._losses.get(reason, 0) + count
 
     def _gone(self, error: BaseException) -> LinkError:
         return LinkError(self._where, f"connection to the bus lost: {_message_of(error)}")
+
+
+def _is_queue_full(error: BaseException) -> bool:
+    """Return True if a frame was not sent only because the transmit queue is full."""
+    code = getattr(error.__cause__ or error, "errno", None)
+    return code in (errno.ENOBUFS, errno.EAGAIN) or str(error) == "Transmit buffer full"  # python-can's, without a code
 
 
 class _DatagramPort(CanPort):
@@ -352,10 +364,12 @@ class SlcanPort(CanPort):
     def __init__(self, where: str, bus: slcanBus) -> None:
         super().__init__(where, bus)
         self._serial = bus.serialPortOrig
+        self._serial.write_timeout = CLOSE_WRITE_S
         self._fd = bus.fileno()
         # Exclusive access: two readers on one port would each get half of the bytes
         fcntl.ioctl(self._fd, termios.TIOCEXCL)
         self._lines = SlcanLines()
+        self._unwritten = b""  # end of a line that the terminal has accepted only in part
 
     def fileno(self) -> int:
         return self._fd
@@ -374,6 +388,14 @@ class SlcanPort(CanPort):
             self._count_lost(ADAPTER_LINE, self._lines.malformed)
             self._lines.malformed = 0
         return Batch([Received(frame, None) for frame in frames], not more_may_wait(data))
+
+    def _send(self, message: can.Message) -> None:
+        """Write the frame's line without waiting; python-can waits, however long, until the adapter has taken it."""
+        self._unwritten = self._unwritten[os.write(self._fd, self._unwritten) :]
+        if self._unwritten:
+            raise BlockingIOError(errno.EAGAIN, os.strerror(errno.EAGAIN))
+        line = slcan_line(_frame(message))
+        self._unwritten = line[os.write(self._fd, line) :]
 
     def close(self) -> None:
         super().close()

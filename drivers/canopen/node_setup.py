@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Generator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 from drivers.can.frame import Frame
@@ -87,8 +87,8 @@ class SetupRunner:
     """Sets up nodes one after the other.
 
     The caller feeds the nodes' answers and the time, and sends the frames returned by `take_frames`. The events
-    returned by `take_events` are CONFIGURED, or ALARM for a node that does not match or does not answer, and WARNING
-    for values that could not be verified.
+    returned by `take_events`, which is called once these frames are sent, are CONFIGURED, or ALARM for a node that does
+    not match or does not answer, and WARNING for values that could not be verified.
     """
 
     def __init__(self) -> None:
@@ -149,7 +149,14 @@ class SetupRunner:
                 self._step(self._setup, DeviceError(self._setup.where, text), now)
 
     def abort(self, now: Stamp, cause: str) -> None:
-        """Cancel all set-ups because of `cause`, with an ALARM for each: they are never resumed automatically."""
+        """Cancel all set-ups because of `cause`, with an ALARM for each: they are never resumed automatically.
+
+        A node whose CONFIGURED event was not taken yet counts as cancelled: its start command may not have been sent.
+        """
+        for number, event in enumerate(self._events):
+            if event.kind is EventKind.CONFIGURED:
+                text = f"{event.device}: set-up was interrupted and may be incomplete because {cause}; request it again"
+                self._events[number] = replace(event, kind=EventKind.ALARM, text=text)
         given_up = [(setup, "was not started") for setup in self._waiting]
         if self._setup is not None:
             given_up.insert(0, (self._setup, "was interrupted and may be incomplete"))

@@ -87,11 +87,13 @@ class StationLink:
         poller = start_poller(self._config)
         last_reads, is_emptied = LastReads(stop), False
         while not last_reads.are_over(is_emptied=is_emptied):
-            if last_reads.have_begun():
-                timeout_s = LAST_READ_S
-            else:
-                wait_s = _LONGEST_READ_S if poller is None else self._send_due(port, poller, emit)
-                timeout_s = self._clock.real_seconds(wait_s)
+            wait_s = _LONGEST_READ_S
+            if poller is not None and not last_reads.have_begun():
+                try:
+                    wait_s = self._send_due(port, poller, emit)
+                except LinkError as error:  # what the port has received is still read
+                    last_reads.begin(error)
+            timeout_s = LAST_READ_S if last_reads.have_begun() else self._clock.real_seconds(wait_s)
             began = self._clock.now()
             data = port.read(timeout_s)
             self._last_read = stamp = self._clock.now()

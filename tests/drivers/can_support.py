@@ -7,6 +7,7 @@ import itertools
 import os
 import pty
 import select
+import termios
 import threading
 import time
 import tty
@@ -181,8 +182,16 @@ class Adapter:
         os.close(self._slave)
         os.close(self._master)
 
+    def accept(self, *, nothing: bool) -> None:
+        """Stop to accept what rigcal writes, or go on; as an adapter whose own buffer is full."""
+        termios.tcflow(self._slave, termios.TCOOFF if nothing else termios.TCOON)
+
     def send(self, data: bytes) -> None:
         os.write(self._master, data)
+
+    def waiting(self) -> bytes:
+        """Return what rigcal has written and nobody has fetched, up to 64 KiB."""
+        return os.read(self._master, 65536) if select.select([self._master], [], [], 0.05)[0] else b""
 
     def commands(self, until: bytes) -> bytes:
         """Return the frames that rigcal sent, up to and with `until`."""

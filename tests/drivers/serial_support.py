@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import pty
 import select
+import termios
 import threading
 import time
 import tty
@@ -94,6 +95,10 @@ class Instrument:
     def close(self) -> None:
         if self._master >= 0:
             self.unplug()
+
+    def accept(self, *, nothing: bool) -> None:
+        """Stop to accept what rigcal writes, or go on; as an adapter whose own buffer is full."""
+        termios.tcflow(self._slave, termios.TCOOFF if nothing else termios.TCOON)
 
     def send(self, data: bytes) -> None:
         os.write(self._master, data)

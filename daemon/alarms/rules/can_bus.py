@@ -82,8 +82,8 @@ def device_alarm(evidence: Evidence) -> Iterator[Finding]:
 def device_warning(evidence: Evidence) -> Iterator[Finding]:
     """A device has given a warning (object 6505h, its set-up, a station's settings) and has not withdrawn it.
 
-    Cleared when the device withdraws it or boots. A warning that the device cannot withdraw is cleared when the link is
-    reopened.
+    A CAN link warns while its transmit queue is full. Cleared when the device withdraws the warning or boots. A warning
+    that the device cannot withdraw is cleared when the link is reopened.
     """
     for event in evidence.active_events(EventKind.WARNING, EventKind.BOOT_UP):
         link = evidence.link_of(event.device)

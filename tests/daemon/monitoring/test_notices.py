@@ -289,6 +289,32 @@ def test_a_store_that_cannot_be_written_keeps_no_notice_back(
     assert web.events() == [("raised", "store")]
 
 
+def test_a_write_that_hangs_keeps_no_notice_back_and_none_is_left_to_be_sent_again(
+    web: WebServer, opened: Callable[..., Sender]
+) -> None:
+    sender = opened(webhook_url=web.url)
+    hangs, go_on = threading.Event(), threading.Event()
+
+    def hang(sql: str) -> None:  # SQLite calls it just before the commit
+        if sql == "COMMIT":
+            hangs.set()
+            go_on.wait(30.0)
+
+    sender.store._db.conn.set_trace_callback(hang)
+    try:
+        sender.tell_only("raised", "store")
+        wait_until(hangs.is_set)
+        wait_until(lambda: web.events() == [("raised", "store")])
+        sender.tell_only("raised", "boom")
+        wait_until(lambda: web.events() == [("raised", "store"), ("raised", "boom")])
+        assert table(sender.path, "notices") == []
+    finally:
+        go_on.set()
+    wait_until(lambda: len(table(sender.path, "notices")) == 2)
+    wait_until(lambda: all(row["sent_utc_ns"] is not None for row in table(sender.path, "notices")))
+    assert [row["subject"] for row in table(sender.path, "notices")] == ["store", "boom"]
+
+
 def test_a_notice_that_no_store_can_hold_is_sent_all_the_same_and_so_are_those_after_it(
     web: WebServer, opened: Callable[..., Sender]
 ) -> None:

@@ -9,7 +9,7 @@ from can.interfaces.udp_multicast.utils import pack_message
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.can.frame import Frame, SlcanLines, parse_can_frame, parse_multicast
+from drivers.can.frame import Frame, SlcanLines, parse_can_frame, parse_multicast, slcan_line
 
 
 def can_frame(identifier: int, data: bytes, length: int | None = None) -> bytes:
@@ -184,3 +184,16 @@ def test_no_bytes_of_an_adapter_make_the_parser_raise(pieces: list[bytes]) -> No
     for piece in pieces:
         for frame in lines.feed(piece):
             assert len(frame.data) <= 8
+
+
+@given(
+    st.one_of(
+        st.builds(Frame, st.integers(0, 0x7FF), st.binary(max_size=8), st.just(False), st.just(False), st.just(False)),
+        st.builds(
+            Frame, st.integers(0, 0x1FFFFFFF), st.binary(max_size=8), st.just(True), st.just(False), st.just(False)
+        ),
+        st.builds(Frame, st.integers(0, 0x7FF), st.just(b""), st.just(False), st.just(True), st.just(False)),
+    )
+)
+def test_the_line_that_sends_a_frame_is_the_line_that_receives_it(frame: Frame) -> None:
+    assert SlcanLines().feed(slcan_line(frame)) == [frame]

@@ -319,6 +319,21 @@ def test_a_lost_link_cuts_all_set_ups_short_and_says_so() -> None:
     assert conversation.take_frames() == []
 
 
+def test_a_node_whose_start_command_is_not_sent_is_not_reported_as_configured() -> None:
+    node, conversation = Node(), SetupRunner()
+    conversation.add(setup())
+    while "1017.0=3E8" not in node.log:
+        conversation.advance(START)
+        for answer in [node.answer(frame) for frame in conversation.take_frames()]:
+            if answer is not None:
+                conversation.feed(answer, START)
+    conversation.abort(START, "the link was lost")
+    (event,) = conversation.take_events()
+    assert (event.kind, event.device) == (EventKind.ALARM, "theta1")
+    assert "set-up was interrupted and may be incomplete because the link was lost" in event.text
+    assert "nmt 01" not in node.log
+
+
 @given(st.lists(st.binary(min_size=8, max_size=8), max_size=40))
 def test_no_answers_make_the_conversation_raise_or_write_before_it_has_checked(answers: list[bytes]) -> None:
     conversation = SetupRunner()
