@@ -419,6 +419,7 @@ class SessionManager:
             session.know(self._setups.control_points(session.setup_id), first_constants_mm(self._store, session.id))
             session.jumped = self._lifecycle.jumped(session)
             self._prisms.restore(session)
+            self._observing.restore(session)
         opened = self._open
         if opened is None:
             return

@@ -6,6 +6,7 @@ change as more fixes arrive.
 
 from __future__ import annotations
 
+import json
 import logging
 import sqlite3
 from collections.abc import Callable, Sequence
@@ -16,10 +17,16 @@ from daemon.acquisition.joiner import JoinedFix
 from daemon.commands import CHECK
 from daemon.sessions.open_session import CONSTANT_TOLERANCE_MM, OpenSession
 from daemon.sessions.prism_watch import PrismWatch
-from daemon.sessions.prisms.standstill_places import Exclusions, StandstillPlaces
+from daemon.sessions.prisms.standstill_places import (
+    ELSEWHERE,
+    SETTLED_FIXES,
+    Exclusions,
+    Standstill,
+    StandstillPlaces,
+)
 from daemon.sessions.station_setups import AXES, Place
 from daemon.store.errors import is_unwritable
-from daemon.store.queries.observations import OF_CONTROL_POINT, ObservationTable
+from daemon.store.queries.observations import OF_CONTROL_POINT, ObservationTable, last_standstills
 from daemon.store.store import Store
 from drivers.clock import Stamp, lies_within
 from drivers.readings import DeviceEvent, Fix
@@ -114,6 +121,15 @@ class ObservationMaker:
         self._places = StandstillPlaces(rig)
         self.newest: tuple[str, Stamp, str | None] | None = None
 
+    def restore(self, session: OpenSession) -> None:
+        """Restore the places of the standstill during which an earlier run of the daemon ended."""
+        with self._store.reader() as reader:
+            for row in last_standstills(reader, session.id, ELSEWHERE, SETTLED_FIXES):
+                standstill, stamp = Standstill.of_pose(session.id, row["pose"]), reader.stamp(row)
+                place_mm, values = (row["x_mm"], row["y_mm"], row["z_mm"]), json.loads(row["values_json"])
+                confirmed = session.confirmations_by(stamp)
+                self._places.add(standstill, stamp.monotonic_ns, place_mm, values, confirmed)
+
     def observe(self, session: OpenSession, joined: JoinedFix, place_mm: Place) -> None:
         """Make an observation of the session in which a fix was measured.
 
@@ -139,8 +155,10 @@ class ObservationMaker:
                 return f"{joint} jumped: its readings after the jump do not fit those before"
         if session.is_control_point(place_mm):
             return OF_CONTROL_POINT
-        self._prisms.follow(session, joined, place_mm)
-        return "moving" if session.kind in STANDING_KINDS and joined.standstill is None else None
+        suspected = self._prisms.follow(session, joined, place_mm)
+        if session.kind in STANDING_KINDS and joined.standstill is None:
+            return suspected or "moving"  # stored, because a restart before the boom stands must not end the suspicion
+        return None
 
     def _why_another_prism(self, session: OpenSession, joined: JoinedFix, place_mm: Place) -> str | None:
         """Return why a fix may be of another prism, and judge earlier fixes again; None if it is not suspected."""
@@ -148,14 +166,17 @@ class ObservationMaker:
         if changed:
             changed |= self._places.withdraw([at_ns for at_ns, why in changed.items() if why is not None])
         excluded = self._prisms.doubt(session, joined.fix)
-        if excluded is None and joined.standstill is not None:
-            standstill, confirmed = (session.id, joined.standstill), session.confirmations_by(joined.fix.stamp)
-            at_ns = joined.stamp.monotonic_ns
+        standstill = self._standstill(session, joined)
+        if excluded is None and standstill is not None:
+            at_ns, confirmed = joined.stamp.monotonic_ns, session.confirmations_by(joined.fix.stamp)
             here = self._places.add(standstill, at_ns, place_mm, joined.values, confirmed)
             excluded = here.pop(at_ns)
             changed |= here
         self._exclude(session, changed, joined.stamp)
         return excluded
+
+    def _standstill(self, session: OpenSession, joined: JoinedFix) -> Standstill | None:
+        return None if joined.standstill is None else Standstill(session.id, self._run_id, joined.standstill)
 
     def _exclude(self, session: OpenSession, changed: Exclusions, stamp: Stamp) -> None:
         if changed:
@@ -165,17 +186,17 @@ class ObservationMaker:
         """Store an observation; a shot may have located a control point at its place since it was judged."""
         if excluded is None and session.is_control_point(place_mm):
             excluded = OF_CONTROL_POINT
-        standing = joined.standstill is not None
+        standstill = self._standstill(session, joined)
         self._table.add(
             self._store.fix_id(joined.fix),
             joined.stamp,
             session_id=session.id,
             setup_id=session.setup_id,
             prism=session.prism,
-            pose=f"{self._run_id}.{joined.standstill}" if standing else None,
+            pose=standstill and standstill.pose,
             **dict(zip(AXES, place_mm, strict=True)),
             dwell_s=joined.dwell_s,
-            moving=not standing,
+            moving=standstill is None,
             values_json=joined.values,
             excluded=excluded,
         )

@@ -96,7 +96,7 @@ class PrismWatch:
         stretch.instants_ns.append(joined.stamp.monotonic_ns)
         return changed
 
-    def follow(self, session: OpenSession, joined: JoinedFix, place_mm: Place) -> None:
+    def follow(self, session: OpenSession, joined: JoinedFix, place_mm: Place) -> str | None:
         """Compare a fix given to `see`, used or not, with the motion of the joints since the previous fix.
 
         A target that has moved differently is another target, even if a prism could have moved as far. Which of the two
@@ -107,23 +107,26 @@ class PrismWatch:
             session: session in which the fix was measured.
             joined: the fix with its joints.
             place_mm: place of its target in the station's frame.
+
+        Returns:
+            Reason of a suspicion that begins with this fix; None if none does.
         """
         guard, evidence = session.guards.get(joined.fix.station), session.evidence
         turn = None if guard is None else guard.turn(joined.fix.stamp)
         if guard is None or evidence is None or turn is None:
-            return
+            return None
         is_suspected = guard.doubt(joined.fix.stamp) is not None
         jump_m = evidence.jump_m(joined, place_mm, turn, is_suspected=is_suspected)
         if jump_m is None:
-            return
+            return None
         is_told = guard.may_turn(joined.fix.stamp)
         turn = guard.part(joined.fix.stamp)
         if is_told:
-            return
+            return None
         text = _moved_otherwise(jump_m, session.prism)
-        if not is_suspected:
-            guard.suspect(turn, jump_m, text)
+        reason = None if is_suspected else guard.suspect(turn, jump_m, text).reason
         self._tell_of_jump(joined.fix.station, text)
+        return reason
 
     def _stray(self, session: OpenSession, joined: JoinedFix, turn: Turn, stretch: Stretch) -> Exclusions:
         """Suspect all fixes since a turn if the target strayed from the joints' motion; return their exclusions.
@@ -222,7 +225,9 @@ class PrismWatch:
             session.confirmations += [OperatorConfirmation(reader.stamp(row), bool(row["turning"])) for row in rows]
             for station in self._limits:
                 for row in fixes_since_used(reader, session.id, station):
-                    self._take(session, _fix(station, row, reader.stamp(row)))
+                    fix = _fix(station, row, reader.stamp(row))
+                    self._take(session, fix)
+                    self._guard(session, station).suspect_again(fix.stamp, row["excluded"] or "")
                 self._guard(session, station).look_away()
         for suspicion in self.suspicions(session):
             log.warning("session %s: %s; %s", session.id, suspicion.reason, suspicion.remedy)

@@ -8,6 +8,7 @@ on it at that time.
 from __future__ import annotations
 
 import math
+import re
 from bisect import bisect_right
 from collections import deque
 from collections.abc import Sequence
@@ -26,6 +27,8 @@ USUAL_OF = 5  # number of intervals; their median is not changed by a single lat
 USUAL_NS = NS_PER_S  # largest usual interval, and the one assumed while fewer than three are known
 PAUSE_NS = 2 * NS_PER_S  # during a pause of this length a station aimed by hand may have been aimed at another target
 TURN_NS = 10 * NS_PER_S  # a jump this long after the station was told to turn is not the turn
+SUSPECTED = "perhaps another prism: "  # prefix of the reasons; stored reasons are read, so it must not change
+_METRES = re.compile(r"(\d+\.\d+) m\b")  # the distance in a reason
 
 _Point = tuple[float, float, float]
 
@@ -92,7 +95,7 @@ class Suspicion:
     def reason(self) -> str:
         """Reason why calibration must not use its fixes."""
         evidence = self.evidence or f"the station's target jumped by {self.distance_m:.2f} m"
-        return f"perhaps another prism: {evidence}"
+        return f"{SUSPECTED}{evidence}"
 
     @property
     def remedy(self) -> str:
@@ -200,6 +203,17 @@ class PrismGuard:
         if until is None:
             self._good = None  # the place of the prism is unknown
         return made
+
+    def suspect_again(self, stamp: Stamp, reason: str) -> None:
+        """Restore a suspicion of an earlier run of the daemon, which may have had more evidence than the fixes.
+
+        Args:
+            stamp: instant of a fix given to `see`.
+            reason: why the earlier run excluded its observation; other reasons are ignored.
+        """
+        if reason.startswith(SUSPECTED) and self.doubt(stamp) is None:
+            metres = _METRES.search(reason)
+            self.suspect(Turn(stamp), float(metres[1]) if metres else 0.0, reason.removeprefix(SUSPECTED))
 
     def clear(self, turn: Turn) -> None:
         """Remove suspicions of the fixes from a turn to the next turn: they are of the session's prism."""

@@ -3,14 +3,16 @@
 A station that lost its prism may lock on to another prism or a reflection, and its fixes look as good as before. Where
 the fixes of a standstill lie at several places, the place with the most fixes is taken for the prism's, and the fixes
 at the others are excluded; while two places have equally many fixes, both are excluded. More fixes may change the
-decision. After an operator confirms the prism, only fixes since then are counted.
+decision. After an operator confirms the prism, only fixes since then are counted. A restart of the daemon does not end
+a standstill.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Hashable, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 from calibration.rig.description import Rig
 from daemon.sessions.station_setups import Place
@@ -25,6 +27,31 @@ EVERY_FIX = 64  # up to this many fixes the decision is checked with each fix, l
 
 Exclusions = dict[int, str | None]
 """Instant of a fix, monotonic ns -> why calibration must not use the fix; None if it may."""
+
+
+class Standstill(NamedTuple):
+    """Identifier of a standstill in a session.
+
+    Attributes:
+        session: id of the session.
+        run: number of the run of the daemon.
+        number: number of the standstill within the run.
+    """
+
+    session: str
+    run: int
+    number: int
+
+    @property
+    def pose(self) -> str:
+        """Its name in the table of observations."""
+        return f"{self.run}.{self.number}"
+
+    @classmethod
+    def of_pose(cls, session: str, pose: str) -> Standstill:
+        """Return the standstill with that name in the table of observations."""
+        run, _, number = pose.partition(".")
+        return cls(session, int(run), int(number))
 
 
 @dataclass
@@ -56,19 +83,21 @@ class StandstillPlaces:
 
     def __init__(self, rig: Rig) -> None:
         self._travel_mm = travel_mm(rig)
-        self._standstill: Hashable = None
+        self._standstill: Standstill | None = None
+        self._joints: Mapping[str, float] = {}  # at the latest fix
         self._places: list[_Place] = []
         self._fixes = 0
         self._decided_at = 0
         self._confirmations = 0
 
     def add(
-        self, standstill: Hashable, at_ns: int, place_mm: Place, values: Mapping[str, float], confirmations: int = 0
+        self, standstill: Standstill, at_ns: int, place_mm: Place, values: Mapping[str, float], confirmations: int = 0
     ) -> Exclusions:
         """Add a fix.
 
         Args:
-            standstill: identifier of the fix's standstill; a new one discards all places.
+            standstill: the fix's standstill; a new one discards all places. The first one of a new run of the daemon is
+                not new if the joints are where they were.
             at_ns: when the fix was measured, monotonic within the standstill.
             place_mm: place of the fix, in the station's frame.
             values: observations CSV column -> number, with the joints at that instant.
@@ -77,14 +106,14 @@ class StandstillPlaces:
         Returns:
             The exclusion of this fix, and of earlier fixes of the standstill whose exclusion has changed.
         """
-        if standstill != self._standstill:
-            self._standstill, self._places, self._fixes, self._decided_at = standstill, [], 0, 0
-            self._confirmations = confirmations
+        joints = {column: values[column] for column in self._travel_mm if column in values}
+        if not self._is_present(standstill, joints):
+            self._places, self._fixes, self._decided_at, self._confirmations = [], 0, 0, confirmations
+        self._standstill, self._joints = standstill, joints
         if confirmations > self._confirmations:
             self._confirmations, self._decided_at = confirmations, 0
             for place in self._places:
                 place.count = 0
-        joints = {column: values[column] for column in self._travel_mm if column in values}
         place = self._place(place_mm, joints)
         place.latest_mm, place.joints = place_mm, joints
         place.count += 1
@@ -108,6 +137,13 @@ class StandstillPlaces:
         self._decided_at = 0
         return self._decide() if self._places else {}
 
+    def _is_present(self, standstill: Standstill, joints: Mapping[str, float]) -> bool:
+        """Return True if a standstill is the present one, or goes on after a restart: the prism is where it was."""
+        present = self._standstill
+        if present is None or present.session != standstill.session or present.run == standstill.run:
+            return present == standstill
+        return self._moved_mm(self._joints, joints) <= SAME_PLACE_MM
+
     def _place(self, place_mm: Place, joints: Mapping[str, float]) -> _Place:
         """Return the nearest place that a fix may belong to, or a new place."""
         near = [place for place in self._places if self._is_near(place, place_mm, joints)]
@@ -123,9 +159,12 @@ class StandstillPlaces:
 
     def _is_near(self, place: _Place, place_mm: Place, joints: Mapping[str, float]) -> bool:
         """Return True if scatter, sway and the joints' motion explain the distance from a place's latest fix."""
-        changes = {column: joints[column] - place.joints[column] for column in joints.keys() & place.joints.keys()}
-        moved_mm = sum(_size(column, change) * self._travel_mm[column] for column, change in changes.items())
-        return math.dist(place_mm, place.latest_mm) <= SAME_PLACE_MM + moved_mm
+        return math.dist(place_mm, place.latest_mm) <= SAME_PLACE_MM + self._moved_mm(place.joints, joints)
+
+    def _moved_mm(self, before: Mapping[str, float], now: Mapping[str, float]) -> float:
+        """Return the largest motion of any prism that the joints' changes explain."""
+        changes = {column: now[column] - before[column] for column in now.keys() & before.keys()}
+        return sum(_size(column, change) * self._travel_mm[column] for column, change in changes.items())
 
     def _decide(self) -> Exclusions:
         """Exclude all places except the one with the most fixes, and return the exclusions that change."""

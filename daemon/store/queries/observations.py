@@ -29,13 +29,20 @@ _MOVING = _OBSERVATIONS.replace("excluded IS NULL", "moving AND coalesce(exclude
 _FIRST = """SELECT utc_ns, monotonic_ns, kernel_boot_id FROM observations JOIN boots ON boots.id = boot_id
     WHERE excluded IS NULL ORDER BY observations.id LIMIT 1"""
 # A station's fixes in a session from the last one that calibration may use, or from the session's start.
-_FIXES = f"""SELECT fixes.* FROM calibration_sessions AS session CROSS JOIN boots CROSS JOIN fixes
+_FIXES = f"""SELECT fixes.*, seen.excluded FROM calibration_sessions AS session CROSS JOIN boots CROSS JOIN fixes
+        LEFT JOIN observations AS seen ON seen.fix_id = fixes.id AND seen.session_id = session.id
     WHERE session.id = ?1 AND station = ?2
         AND {since("fixes.", ("session.started_boot_id", "session.started_monotonic_ns"))}
         AND fixes.id >= coalesce((SELECT fix_id FROM observations AS o CROSS JOIN fixes AS used ON used.id = fix_id
             WHERE session_id = ?1 AND excluded IS NULL AND used.station = ?2
             ORDER BY o.boot_id DESC, o.monotonic_ns DESC LIMIT 1), 0)
     ORDER BY fixes.id"""
+# Observations of the last standstill of each run of the daemon; poses are called `run.standstill`.
+_LAST_STANDSTILLS = """SELECT pose, utc_ns, monotonic_ns, boot_id, x_mm, y_mm, z_mm, values_json FROM observations
+    WHERE session_id = ?1 AND (excluded IS NULL OR excluded LIKE ?2) AND pose IN (
+        SELECT pose FROM (SELECT pose, max(id) FROM observations WHERE session_id = ?1 AND pose IS NOT NULL
+            GROUP BY substr(pose, 1, instr(pose, '.'))))
+    ORDER BY id LIMIT ?3"""
 
 # Each station's oldest fix that is of the prism, as far as is known, and contains a prism constant. A station that
 # transmits constants does so from its first fix on, so the rest of a long session is not read.
@@ -213,5 +220,24 @@ def first_constants_mm(source: RowSource, session_id: str) -> dict[str, float]:
 
 
 def fixes_since_used(source: RowSource, session_id: str, station: str) -> Iterator[dict[str, Any]]:
-    """Return a station's fixes in a session, from the last one that calibration may use, or from its start."""
+    """Return a station's fixes in a session, from the last one that calibration may use, or from its start.
+
+    Returns:
+        Rows of `fixes` with `excluded` of their observations; None where a fix is used or has no observation.
+    """
     return iter(source.rows(_FIXES, (session_id, station)))
+
+
+def last_standstills(source: RowSource, session_id: str, excluded: str, most: int) -> Iterator[dict[str, Any]]:
+    """Return the observations of the last standstill of each run of the daemon in a session, oldest first.
+
+    Args:
+        source: the store.
+        session_id: the session.
+        excluded: beginning of a reason; observations that are excluded for another reason are left out.
+        most: largest number of observations.
+
+    Returns:
+        pose, utc_ns, monotonic_ns, boot_id, x_mm, y_mm, z_mm and values_json of each.
+    """
+    return iter(source.rows(_LAST_STANDSTILLS, (session_id, f"{excluded}%", most)))

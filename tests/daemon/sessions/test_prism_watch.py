@@ -46,6 +46,7 @@ serial.path = "/dev/rigcal-station"
 """
 PRISM_MM = (3000.0, 8000.0, 1000.0)
 ANOTHER_MM = (3000.0, 18000.0, 1000.0)
+NEARER_MM = (6000.0, 8000.0, 1000.0)  # one fix a second does not show this jump of 3 m, but the joints do
 CONTROL_MM = (9000.0, 500.0, 2000.0)
 
 
@@ -53,6 +54,7 @@ class WatchedRig(Rig):
     """A rig whose configuration names its station."""
 
     def new_keeper(self, aim: Callable[[str], None] | None = None) -> SessionManager:
+        self.runs += 1
         return SessionManager(
             SOURCE.rig,
             SOURCE.text,
@@ -61,7 +63,7 @@ class WatchedRig(Rig):
             ObservationJoiner(joint_inputs(SOURCE.rig), settle_s=0.5),
             SessionsSection(fixes_per_shot=3),
             self.clock,
-            run_id=1,
+            run_id=self.runs,
             aim=aim,
             limits={"station": MotionLimit()},
         )
@@ -189,6 +191,38 @@ def test_a_restart_of_the_daemon_ends_no_suspicion(rig: Rig) -> None:
     rig.say("confirm_prism")
     rig.keeper = rig.new_keeper()
     assert rig.keeper.prism_suspicions() == []
+
+
+@pytest.mark.parametrize("steps_of_fix", [1, 20])
+def test_a_restart_ends_no_suspicion_that_the_first_fixes_after_it_do_not_show(rig: Rig, steps_of_fix: int) -> None:
+    rig.steps_of_fix = steps_of_fix
+    start(rig)
+    rig.live(5)
+    rig.target_mm = NEARER_MM
+    rig.live(4)
+    (before,) = rig.keeper.prism_suspicions()
+    for _ in range(2):
+        rig.keeper = rig.new_keeper()
+        (after,) = rig.keeper.prism_suspicions()
+        assert (after.reason, round(after.distance_m, 2)) == (before.reason, 3.0)
+        rig.live(5)
+    assert {round(row["x_mm"]) for row in table(rig.store.path, "observations") if row["excluded"] is None} == {3000}
+    rig.say("confirm_prism")
+    rig.keeper = rig.new_keeper()
+    assert rig.keeper.prism_suspicions() == []
+
+
+def test_a_suspicion_that_began_while_the_boom_moved_outlasts_a_restart_before_it_stands(rig: Rig) -> None:
+    rig.steps_of_fix = 20
+    start(rig)
+    rig.live(5)
+    rig.target_mm = NEARER_MM
+    rig.live(3, theta1=0.5)
+    assert len(rig.keeper.prism_suspicions()) == 1
+    rig.keeper = rig.new_keeper()
+    assert len(rig.keeper.prism_suspicions()) == 1
+    rig.live(5)
+    assert {round(row["x_mm"]) for row in table(rig.store.path, "observations") if row["excluded"] is None} == {3000}
 
 
 def test_another_prism_that_was_found_while_the_daemon_was_away_is_suspected(rig: Rig) -> None:

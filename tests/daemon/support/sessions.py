@@ -44,11 +44,13 @@ class Rig:
     Attributes:
         steps_of_fix: the station gives a fix in every so many steps.
         machine: what a new keeper takes for the machine.
+        runs: how many keepers there have been; each is of a new run of the daemon.
         observing: surrounds the making of observations from records that are stored.
     """
 
     steps_of_fix = 1
     machine = SOURCE.rig
+    runs = 0
     observing: Callable[[], contextlib.AbstractContextManager[object]] = staticmethod(contextlib.nullcontext)
 
     def __init__(self, path: Path) -> None:
@@ -64,6 +66,7 @@ class Rig:
         self.keeper = self.new_keeper()
 
     def new_keeper(self, aim: Callable[[str], None] | None = None) -> SessionManager:
+        self.runs += 1
         joiner = ObservationJoiner(joint_inputs(self.machine), signal_inputs(self.machine), settle_s=0.5)
         return SessionManager(
             self.machine,
@@ -73,7 +76,7 @@ class Rig:
             joiner,
             SessionsSection(fixes_per_shot=3),
             self.clock,
-            run_id=1,
+            run_id=self.runs,
             aim=aim,
             clock_state=lambda: self.clock_state,
         )
