@@ -1,12 +1,14 @@
-"""Notices: alarms that are sent from the machine, by a separate thread that nothing waits for.
+"""Notices: alarms that are sent from the machine, by threads that nothing waits for.
 
-A second thread writes them to the store, so that they are also sent while a write hangs.
+Each target has a thread, so that none waits for another. One more writes notices to the store, so that they are also
+sent while a write hangs.
 """
 
 from __future__ import annotations
 
 import logging
 import threading
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -55,37 +57,26 @@ class Notices:
         )
         for outbox in self._outboxes:
             outbox.reconcile(active, clock.now())
-        self._inbox: list[Notice] = []
-        self._changed = threading.Condition()
-        self._is_stopping = False
-        self._fault = ""  # last error of the thread itself
-        self._thread = threading.Thread(target=self._run, name="notices", daemon=True)
         self._writer = _Writer(self._outboxes)
-        self._status = [outbox.status() for outbox in self._outboxes]
+        self._senders = [_Sender(outbox, self._writer.write_soon) for outbox in self._outboxes]
 
     def start(self) -> None:
         """Start to send."""
-        if self._outboxes:
-            self._thread.start()
-            self._writer.start()
+        if self._senders:
+            for thread in (*self._senders, self._writer):
+                thread.start()
 
     def stop(self) -> None:
         """Stop sending; pending notices stay in the store for the next start."""
-        with self._changed:
-            self._is_stopping = True
-            self._changed.notify()
-        for outbox in self._outboxes:
-            outbox.target.cancel()
-        if self._thread.is_alive():
-            self._thread.join(STOP_S)
-        self._writer.stop()
+        for sender in self._senders:
+            sender.cancel()
+        for thread in (*self._senders, self._writer):
+            thread.stop()
 
     def take(self, notice: Notice) -> None:
         """Queue a notice; from any thread, without waiting."""
-        if self._outboxes:
-            with self._changed:
-                self._inbox.append(notice)
-                self._changed.notify()
+        for sender in self._senders:
+            sender.take(notice)
 
     def try_command(self, _arguments: Mapping[str, Any]) -> str:
         """Send a test notice, to see whether notices arrive."""
@@ -99,17 +90,46 @@ class Notices:
 
     def status(self) -> list[dict[str, Any]]:
         """Return `target`, `waiting`, `sent`, `failures` and `error` of each target."""
-        return self._status
+        return [sender.status for sender in self._senders]
 
     def faults(self) -> dict[str, str]:
-        """Return target -> error of its last delivery if that failed; all targets if the thread itself has failed."""
-        errors = {one["target"]: self._fault or one["error"] for one in self._status}
+        """Return target -> error of its last delivery if that failed, or of its thread."""
+        errors = {sender.status["target"]: sender.fault or sender.status["error"] for sender in self._senders}
         return {target: error for target, error in errors.items() if error}
 
-    # ---- the thread --------------------------------------------------------------------------------------------------
+
+class _Sender(WorkerThread):
+    """Sends the notices of one target.
+
+    Args:
+        outbox: the target's notices.
+        write_soon: has changes of the outbox written to the store.
+
+    Attributes:
+        status: state of the outbox, as `Outbox.status` returns it.
+        fault: last error of the thread itself; "" if it works.
+    """
+
+    def __init__(self, outbox: Outbox, write_soon: Callable[[], None]) -> None:
+        super().__init__(f"notices-{outbox.target.name}", STOP_S)
+        self._outbox, self._write_soon = outbox, write_soon
+        self._inbox: deque[Notice] = deque()
+        self._woken = threading.Event()
+        self.status, self.fault = outbox.status(), ""
+
+    def take(self, notice: Notice) -> None:
+        """Queue a notice; from any thread, without waiting."""
+        self._inbox.append(notice)
+        self._woken.set()
+
+    def cancel(self) -> None:
+        """End the present delivery, and ask the thread to end."""
+        self._stopping.set()
+        self._woken.set()
+        self._outbox.target.cancel()
 
     def _run(self) -> None:
-        while not self._is_stopping:
+        while not self._stopping.is_set():
             self._go_on(self._step)
         self._go_on(self._take_in)
 
@@ -117,39 +137,30 @@ class Notices:
         """Do a step and go on after any error, as an error of rigcal must not stop notices for months."""
         try:
             work()
-            self._fault = ""
+            self.fault = ""
         except Exception as error:
             fault = f"{type(error).__name__}: {error}"
-            if fault != self._fault:
-                log.exception("the thread that sends notices has failed and will try again")
-            self._fault = fault
-            with self._changed:
-                self._changed.wait_for(lambda: self._is_stopping, REWRITE_S)
+            if fault != self.fault:
+                log.exception(
+                    "the thread that sends notices by %s has failed and will try again", self.status["target"]
+                )
+            self.fault = fault
+            self._stopping.wait(REWRITE_S)
 
     def _step(self) -> None:
-        with self._changed:
-            if not self._inbox and not self._is_stopping:
-                self._changed.wait(self._patience_s())
+        self._woken.wait(self._outbox.due_in_s())
+        self._woken.clear()
         self._take_in()
-        for outbox in self._outboxes:
-            if outbox.due_in_s() == 0.0 and not self._is_stopping:
-                outbox.send()
-        self._writer.write_soon()
-        self._status = [outbox.status() for outbox in self._outboxes]
+        if self._outbox.due_in_s() == 0.0 and not self._stopping.is_set():
+            self._outbox.send()
+            self._write_soon()
+        self.status = self._outbox.status()
 
     def _take_in(self) -> None:
-        with self._changed:
-            taken = list(self._inbox)
-        for outbox in self._outboxes:
-            for notice in taken:
-                outbox.add(notice)
-        with self._changed:
-            del self._inbox[: len(taken)]
-        self._writer.write_soon()
-
-    def _patience_s(self) -> float | None:
-        """Return how long the thread may sleep, seconds; None to sleep until it is woken."""
-        return min((due for outbox in self._outboxes if (due := outbox.due_in_s()) is not None), default=None)
+        while self._inbox:
+            self._outbox.add(self._inbox[0])
+            self._inbox.popleft()
+        self._write_soon()
 
 
 class _Writer(WorkerThread):

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import logging
 import sqlite3
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 
 from calibration.rig.description import Rig
@@ -138,11 +138,14 @@ class ObservationMaker:
             joined: the fix with its joints.
             place_mm: place of the fix in the station's frame.
         """
+        constants_mm = session.constants_mm  # before the control points are asked for: both are renewed together
         excluded = (
             self._why_not_a_pose(session, joined, place_mm)
+            or _why_another_constant(constants_mm, joined.fix)
             or self._why_another_prism(session, joined, place_mm)
-            or _why_another_constant(session, joined.fix)
         )
+        if excluded is None and joined.fix.prism_constant_mm is not None:
+            constants_mm.setdefault(joined.fix.station, joined.fix.prism_constant_mm)
         self.newest = session.id, joined.stamp, excluded
         self._pending.add(lambda: self._add(session, joined, place_mm, excluded))
 
@@ -202,11 +205,16 @@ class ObservationMaker:
         )
 
 
-def _why_another_constant(session: OpenSession, fix: Fix) -> str | None:
-    """Return a clause if a fix's prism constant differs from that of the session's first usable fix, otherwise None."""
-    if fix.prism_constant_mm is None:
-        return None
-    first_mm = session.constants_mm.setdefault(fix.station, fix.prism_constant_mm)
-    if abs(fix.prism_constant_mm - first_mm) <= CONSTANT_TOLERANCE_MM:
+def _why_another_constant(constants_mm: Mapping[str, float], fix: Fix) -> str | None:
+    """Return a clause if a fix's prism constant differs from that of its station's first usable fix, otherwise None.
+
+    It is asked for before the prism: findings about the prism replace earlier verdicts, but not this one.
+    """
+    first_mm = constants_mm.get(fix.station, fix.prism_constant_mm)
+    if (
+        fix.prism_constant_mm is None
+        or first_mm is None
+        or abs(fix.prism_constant_mm - first_mm) <= CONSTANT_TOLERANCE_MM
+    ):
         return None
     return f"the station applies a prism constant of {fix.prism_constant_mm:g} mm, but applied {first_mm:g} mm at first"

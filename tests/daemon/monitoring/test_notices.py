@@ -160,6 +160,13 @@ def test_one_way_that_fails_does_not_hold_up_the_other(web: WebServer, opened: C
     assert sender.status()["error"] is None
 
 
+def test_a_command_that_hangs_does_not_hold_up_the_webhook(web: WebServer, opened: Callable[..., Sender]) -> None:
+    sender = opened(webhook_url=web.url, command=["/bin/sleep", "1000"])
+    for number, subject in enumerate(("boom", "station"), start=1):  # the second while the command is waited for
+        sender.tell("raised", subject)
+        wait_until(lambda number=number: len(web.events()) == number)
+
+
 @pytest.mark.parametrize(
     ("scheme", "begin"),
     [("http", b""), ("http", b"HTTP/1.1 200 OK\r\nX-Slow: "), ("https", b"\x16\x03\x03\x3f\xff")],

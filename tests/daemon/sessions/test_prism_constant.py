@@ -49,6 +49,19 @@ def test_fixes_with_another_prism_constant_than_the_session_began_with_are_not_u
     assert len(used) == 60, "40 before, and 20 after the boom stood long enough again"
 
 
+def test_fixes_with_another_prism_constant_stay_unused_where_they_are_the_most_of_a_standstill(
+    rig: ConstantRig,
+) -> None:
+    rig.say("start", prism="r")
+    rig.live(2)
+    x, y, z = rig.target_mm
+    rig.target_mm, rig.constant_mm = (x, y + 250.0, z), 0.0  # as from another prism, which is too near to be a jump
+    rig.live(5)
+    constants = {row["id"]: row["prism_constant_mm"] for row in table(rig.store.path, "fixes")}
+    used = [row["fix_id"] for row in table(rig.store.path, "observations") if row["excluded"] is None]
+    assert {constants[fix] for fix in used} == {-30.0}
+
+
 def test_a_station_that_does_not_say_its_prism_constant_is_taken_at_its_word(rig: ConstantRig) -> None:
     rig.constant_mm = None
     name = controlled(rig)
