@@ -18,7 +18,7 @@ from daemon.alarms.alarm import Alarm, Rule
 from daemon.alarms.evidence import Evidence
 from daemon.alarms.library import library
 from daemon.host.safe_output import duration
-from daemon.host.worker_thread import WorkerThread
+from daemon.host.worker_thread import WokenThread
 from daemon.monitoring.notice import Notice, Severity
 from daemon.store.errors import StoreError
 from daemon.store.queries.alarms import AlarmTable
@@ -65,7 +65,7 @@ def _notice(event: Literal["raised", "cleared"], active: _Active, at: Stamp) -> 
     return Notice(event, **vars(active.alarm), raised=active.raised, at=at)
 
 
-class AlarmBoard(WorkerThread):
+class AlarmBoard(WokenThread):
     """Keeps the alarms. One thread calls `evaluate` once a second; any thread may call the other methods.
 
     Args:
@@ -97,13 +97,6 @@ class AlarmBoard(WorkerThread):
         self._failed_rules: dict[str, str] = {}
         self._paused_rules: set[str] = set()
         self._told: dict[str, str] = {}  # what failed -> the error that was logged last
-        self._to_write = threading.Event()
-
-    def stop(self) -> None:
-        """Write pending alarms and end the thread."""
-        self._stopping.set()
-        self._to_write.set()
-        super().stop()
 
     def evaluate(self) -> None:
         """Apply all rules to the present evidence; never raises and never waits for the disk."""
@@ -114,7 +107,7 @@ class AlarmBoard(WorkerThread):
                 self._raise(found, evidence.now)
                 self._clear(found, evidence.now)
                 self._looked = evidence.now
-            self._to_write.set()
+            self.wake()
         except Exception as error:  # noqa: BLE001 - logged; alarms must go on
             self._log_once("the alarms could not be evaluated", error)
 
@@ -199,16 +192,11 @@ class AlarmBoard(WorkerThread):
                 lasted = duration(max(now.since(active.raised) / NS_PER_S, 0.0))
                 log.info("alarm %s, %s is over after %s", active.alarm.kind, active.alarm.subject, lasted)
 
-    def _run(self) -> None:
-        is_last = False
-        while not is_last:
-            self._to_write.wait()
-            self._to_write.clear()
-            is_last = self._stopping.is_set()  # asked before the write: what is pending at a stop is still written
-            try:
-                self.write()
-            except Exception as error:  # noqa: BLE001 - logged; a fault must not end the writing of alarms
-                self._log_once("the alarms could not be written", error)
+    def _work(self) -> None:
+        try:
+            self.write()
+        except Exception as error:  # noqa: BLE001 - logged; a fault must not end the writing of alarms
+            self._log_once("the alarms could not be written", error)
 
     def _log_once(self, what: str, error: Exception) -> None:
         if str(error) != self._told.get(what):

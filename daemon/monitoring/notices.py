@@ -7,14 +7,13 @@ sent while a write hangs.
 from __future__ import annotations
 
 import logging
-import threading
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from daemon.commands import CommandError, current_caller
 from daemon.config.sections import NotifySection
-from daemon.host.worker_thread import WorkerThread
+from daemon.host.worker_thread import WokenThread
 from daemon.monitoring.delivery import Command, Target, Webhook
 from daemon.monitoring.notice import Notice
 from daemon.monitoring.outbox import USUAL, Outbox, Pace
@@ -58,7 +57,7 @@ class Notices:
         for outbox in self._outboxes:
             outbox.reconcile(active, clock.now())
         self._writer = _Writer(self._outboxes)
-        self._senders = [_Sender(outbox, self._writer.write_soon) for outbox in self._outboxes]
+        self._senders = [_Sender(outbox, self._writer.wake) for outbox in self._outboxes]
 
     def start(self) -> None:
         """Start to send."""
@@ -98,7 +97,7 @@ class Notices:
         return {target: error for target, error in errors.items() if error}
 
 
-class _Sender(WorkerThread):
+class _Sender(WokenThread):
     """Sends the notices of one target.
 
     Args:
@@ -114,83 +113,52 @@ class _Sender(WorkerThread):
         super().__init__(f"notices-{outbox.target.name}", STOP_S)
         self._outbox, self._write_soon = outbox, write_soon
         self._inbox: deque[Notice] = deque()
-        self._woken = threading.Event()
         self.status, self.fault = outbox.status(), ""
 
     def take(self, notice: Notice) -> None:
         """Queue a notice; from any thread, without waiting."""
         self._inbox.append(notice)
-        self._woken.set()
+        self.wake()
 
     def cancel(self) -> None:
         """End the present delivery, and ask the thread to end."""
         self._stopping.set()
-        self._woken.set()
         self._outbox.target.cancel()
 
-    def _run(self) -> None:
-        while not self._stopping.is_set():
-            self._go_on(self._step)
-        self._go_on(self._take_in)
+    def _patience_s(self) -> float | None:
+        return 0.0 if self._inbox else self._outbox.due_in_s()
 
-    def _go_on(self, work: Callable[[], None]) -> None:
-        """Do a step and go on after any error, as an error of rigcal must not stop notices for months."""
+    def _work(self) -> None:
+        """Take in new notices and send what is due; go on after any error, as notices must not stop for months."""
         try:
-            work()
-            self.fault = ""
+            while self._inbox:
+                self._outbox.add(self._inbox[0])
+                self._inbox.popleft()
+            if self._outbox.due_in_s() == 0.0 and not self._stopping.is_set():
+                self._outbox.send()
+            self.status, self.fault = self._outbox.status(), ""
         except Exception as error:
             fault = f"{type(error).__name__}: {error}"
             if fault != self.fault:
-                log.exception(
-                    "the thread that sends notices by %s has failed and will try again", self.status["target"]
-                )
+                log.exception("the thread %s has failed and will try again", self._thread.name)
             self.fault = fault
             self._stopping.wait(REWRITE_S)
-
-    def _step(self) -> None:
-        self._woken.wait(self._outbox.due_in_s())
-        self._woken.clear()
-        self._take_in()
-        if self._outbox.due_in_s() == 0.0 and not self._stopping.is_set():
-            self._outbox.send()
+        finally:
             self._write_soon()
-        self.status = self._outbox.status()
-
-    def _take_in(self) -> None:
-        while self._inbox:
-            self._outbox.add(self._inbox[0])
-            self._inbox.popleft()
-        self._write_soon()
 
 
-class _Writer(WorkerThread):
+class _Writer(WokenThread):
     """Writes the notices of all outboxes to the store; repeats writes that fail."""
 
     def __init__(self, outboxes: Sequence[Outbox]) -> None:
         super().__init__("notices-store", STOP_S)
         self._outboxes = outboxes
-        self._to_write = threading.Event()
         self._is_told = False  # whether it was logged that the store cannot be written
 
-    def write_soon(self) -> None:
-        """Write all changes soon, without waiting for that."""
-        self._to_write.set()
+    def _patience_s(self) -> float | None:
+        return None if all(outbox.is_written for outbox in self._outboxes) else REWRITE_S
 
-    def stop(self) -> None:
-        """Write pending changes and end the thread."""
-        self._stopping.set()
-        self._to_write.set()
-        super().stop()
-
-    def _run(self) -> None:
-        is_last = False
-        while not is_last:
-            self._to_write.wait(None if all(outbox.is_written for outbox in self._outboxes) else REWRITE_S)
-            self._to_write.clear()
-            is_last = self._stopping.is_set()  # asked before the write: what is pending at a stop is still written
-            self._write()
-
-    def _write(self) -> None:
+    def _work(self) -> None:
         try:
             for outbox in self._outboxes:
                 outbox.write()

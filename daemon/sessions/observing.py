@@ -210,11 +210,9 @@ def _why_another_constant(constants_mm: Mapping[str, float], fix: Fix) -> str | 
 
     It is asked for before the prism: findings about the prism replace earlier verdicts, but not this one.
     """
+    if fix.prism_constant_mm is None:
+        return None
     first_mm = constants_mm.get(fix.station, fix.prism_constant_mm)
-    if (
-        fix.prism_constant_mm is None
-        or first_mm is None
-        or abs(fix.prism_constant_mm - first_mm) <= CONSTANT_TOLERANCE_MM
-    ):
+    if abs(fix.prism_constant_mm - first_mm) <= CONSTANT_TOLERANCE_MM:
         return None
     return f"the station applies a prism constant of {fix.prism_constant_mm:g} mm, but applied {first_mm:g} mm at first"

@@ -333,13 +333,14 @@ def test_a_notice_that_no_store_can_hold_is_sent_all_the_same_and_so_are_those_a
     wait_until(lambda: web.events() == [("raised", "clock"), ("raised", "boom")])
 
 
+@pytest.mark.parametrize("fault", [(outbox, "HOUR_S"), (outbox.Outbox, "add")], ids=["sending", "taking in"])
 def test_a_fault_of_the_thread_that_sends_is_told_and_keeps_nothing_back_once_it_is_over(
-    web: WebServer, opened: Callable[..., Sender], monkeypatch: pytest.MonkeyPatch
+    web: WebServer, opened: Callable[..., Sender], monkeypatch: pytest.MonkeyPatch, fault: tuple[object, str]
 ) -> None:
     monkeypatch.setattr("daemon.monitoring.notices.REWRITE_S", 0.05)
     sender = opened(webhook_url=web.url)
     with monkeypatch.context() as broken:
-        broken.setattr(outbox, "HOUR_S", None)
+        broken.setattr(*fault, None)
         sender.tell("raised", "boom")
         wait_until(lambda: "TypeError" in sender.notices.faults().get("webhook", ""))
     wait_until(lambda: web.events() == [("raised", "boom")])
