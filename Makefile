@@ -121,8 +121,9 @@ bench: setup ## speed and accuracy beside the peers', as ratios; an hour on two 
 soak: setup ## the daemon on a simulated rig at 4x with every fault at random; 30 minutes (SOAK="--seed 7 --minutes 5")
 	$(BIN)/python -m tests.soak $(SOAK)
 
-# One target after the other, each at most an hour; FUZZ="dbc eds --seconds 60" chooses. Inputs that find faults: fuzz-faults/
-fuzz: setup ## a million hostile inputs for every decoder, file reader and socket command; up to a day
+# One target after the other, each at most an hour; FUZZ="dbc eds --seconds 60" chooses. Inputs that find faults:
+# fuzz-faults/. What was measured in the present state of a target's sources is in tests/fuzz/measured.json.
+fuzz: setup ## a million hostile inputs for every decoder, file reader and socket command; hours
 	nice $(BIN)/python -m tests.fuzz $(FUZZ)
 
 # The rig gets requirements.lock, with the build backend that installs the project itself; requirements-dev.lock holds

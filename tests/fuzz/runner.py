@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import subprocess
 import sys
 import tempfile
 import time
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -19,6 +21,9 @@ HANG_S = 5.0
 MEMORY_MB = 500
 _POLL_S = 0.1
 _WAITS = 12  # hangs that do not use the processor: other processes may keep it busy
+_SLICE_S = (
+    300.0  # of the processor's time, that one process is fed: what it reports is lost if it is ended from outside
+)
 _START_S = 300.0  # to prepare a target: kernels may have to be compiled
 
 
@@ -29,6 +34,7 @@ class Report:
     Attributes:
         name: of the target.
         inputs: how many were tried.
+        fed_s: of the processor's time, with what it takes to make the inputs.
         spent_s: of the processor's time, in the target itself.
         slowest_s: the slowest input.
         faults: what was raised and where -> how often.
@@ -39,6 +45,7 @@ class Report:
 
     name: str
     inputs: int = 0
+    fed_s: float = 0.0
     spent_s: float = 0.0
     slowest_s: float = 0.0
     faults: Counter[str] = field(default_factory=Counter)
@@ -67,8 +74,10 @@ def run_target(
     module: str = "",
     hang_s: float = HANG_S,
     memory_mb: int = MEMORY_MB,
+    report: Report | None = None,
+    each: Callable[[Report], None] = lambda _: None,
 ) -> Report:
-    """Feed a target until it has had so many inputs, or so many seconds are over.
+    """Feed a target until it has had so many inputs, or so many seconds of the processor's time.
 
     Args:
         target: which.
@@ -78,13 +87,15 @@ def run_target(
         module: where the target is defined; by default it is looked for in the folder of targets.
         hang_s: an input may take no longer of the processor's time.
         memory_mb: beyond what the target has at rest.
+        report: of an earlier run with the same seed, which goes on.
+        each: called with the report after every process.
     """
-    report = Report(target.name)
-    end = time.monotonic() + seconds
-    while report.inputs < inputs and time.monotonic() < end:
+    report = report or Report(target.name)
+    while report.inputs < inputs and report.fed_s < seconds:
         count = min(inputs - report.inputs, target.inputs_per_process)
-        left = max(1, round(end - time.monotonic()))
-        _run_process(target, report, faults, [seed, report.inputs, count, left, memory_mb], module, hang_s)
+        slice_s = math.ceil(min(_SLICE_S, seconds - report.fed_s))
+        _run_process(target, report, faults, [seed, report.inputs, count, slice_s, memory_mb], module, hang_s)
+        each(report)
     return report
 
 
@@ -111,6 +122,7 @@ def _run_process(target: Target, report: Report, faults: Path, numbers: list[int
         if process.returncode == 0:
             result = json.loads(told.splitlines()[-1])
             report.inputs += result["inputs"]
+            report.fed_s += result["fed_s"]
             report.spent_s += result["spent_s"]
             report.slowest_s = max(report.slowest_s, result["slowest_s"])
             report.faults.update(result["faults"])

@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from tests.fuzz.child import an_input
-from tests.fuzz.runner import run_target
+from tests.fuzz.measured import Measured
+from tests.fuzz.runner import Report, run_target
 from tests.fuzz.target import CORPUS, find_targets
 
 CHANGES = 200
@@ -77,3 +78,35 @@ def test_the_runner_ends_a_target_that_hangs_and_goes_on(tmp_path: Path) -> None
     report = run_target(find_targets(module)["hanging"], tmp_path, inputs=2, seconds=60, module=module, hang_s=0.3)
     assert (report.inputs, report.crashes, report.hangs) == (2, 0, 2)
     assert "took longer than 0.3 s" in next(tmp_path.glob("*.txt")).read_text()
+
+
+def test_a_run_goes_on_with_what_was_measured_in_this_state_with_this_seed(tmp_path: Path) -> None:
+    module, file = "tests.fuzz.faulty", tmp_path / "measured.json"
+    target = find_targets(module)["sound"]
+    measured = Measured(1, file)
+    assert measured.report(target) == Report("sound")
+    first = run_target(
+        target, tmp_path, inputs=3, seconds=60, module=module, each=lambda report: measured.note(target, report)
+    )
+    assert first.inputs == 3
+    assert Measured(2, file).report(target).inputs == 0
+    kept = Measured(1, file).report(target)
+    assert kept.inputs == 3
+    assert run_target(target, tmp_path, inputs=5, seconds=60, module=module, report=kept).inputs == 5
+    file.write_text(file.read_text().replace(measured.state(target), "of other sources"))
+    assert Measured(1, file).report(target).inputs == 0
+
+
+def test_a_target_in_which_a_fault_was_found_counts_as_not_measured(tmp_path: Path) -> None:
+    module, file = "tests.fuzz.faulty", tmp_path / "measured.json"
+    target = find_targets(module)["raising"]
+    measured = Measured(1, file)
+    assert measured.report(target).inputs == 0
+    measured.note(target, run_target(target, tmp_path, inputs=3, seconds=60, module=module))
+    assert measured.report(target).inputs == 0
+
+
+def test_the_state_of_a_target_is_that_of_the_sources_that_it_runs() -> None:
+    measured = Measured(1)
+    assert measured.state(TARGETS["eds"]) == measured.state(TARGETS["dbc"])
+    assert measured.state(TARGETS["eds"]) != measured.state(TARGETS["model"])

@@ -119,7 +119,7 @@ def test_after_a_session_it_says_what_else_to_measure(tmp_path: Path) -> None:
         (("--poses", "5", "--separate", "backlash@theta1"), "'backlash@theta1' is not two or three effects"),
         (("--poses", "5", "--separate", "joint_compliance@theta1,backlash@theta1"), "does nothing at theta1"),
         (("--poses", "5", "--setup", "A"), "names a set-up of a model; give --model"),
-        (("--poses", "5", "--model", "/nonexistent"), "/nonexistent is not a directory"),
+        (("--poses", "5", "--model", "/proc/nonexistent"), "/proc/nonexistent is not a directory"),
     ],
 )
 def test_wrong_use_is_one_sentence(arguments: tuple[str, ...], sentence: str) -> None:
