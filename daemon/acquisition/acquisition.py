@@ -270,9 +270,11 @@ class Acquisition:
         ):
             return False
         self._decoded = None
-        # Records of an earlier run do not show the present state.
-        hand_on = self._pass_on if self._is_left_over else self._hand_on
-        hand_on([*decoded.reports, *decoded.records])
+        records = [*decoded.reports, *decoded.records]
+        if self._is_left_over:
+            self._pass_on(records)  # records of an earlier run do not show the present state
+        else:
+            self._hand_on(records, decoded.until)
         return True
 
     def _decode(self, now: Stamp) -> None:
@@ -286,10 +288,12 @@ class Acquisition:
             self._tell_of_left_overs(is_left_over=is_left_over)
         batch = batch or Batch((), ())
         records = [*batch.failures, *self._decoding.feed(batch.captures)]
+        until = _end(batch.captures)
         if is_tick and not is_left_over:
             records += self._decoding.tick(now)
             self._next_tick_ns = now.monotonic_ns + TICK_NS
-        self._decoded = _Decoded(batch.chunk_ids, batch.reports, records)
+            until = now
+        self._decoded = _Decoded(batch.chunk_ids, batch.reports, records, until)
 
     def _tell_of_left_overs(self, *, is_left_over: bool) -> None:
         self._is_left_over = is_left_over
@@ -340,7 +344,7 @@ class Acquisition:
             _tell_of_links(batch.reports)
             records = self._decoding.feed_and_tick(batch.captures)
             self._commit_records(records, batch.chunk_ids)
-            self._hand_on([*batch.reports, *records])
+            self._hand_on([*batch.reports, *records], _end(batch.captures))
 
     # ---- the writer's work -----------------------------------------------------------------------------------------
 
@@ -378,8 +382,8 @@ class Acquisition:
             for record in records:
                 self._insert([record])
 
-    def _hand_on(self, records: Sequence[Record]) -> None:
-        self._board.recorded(records)
+    def _hand_on(self, records: Sequence[Record], until: Stamp | None) -> None:
+        self._board.recorded(records, until)
         self._pass_on(records)
 
     def _pass_on(self, records: Sequence[Record]) -> None:
@@ -432,11 +436,16 @@ class Acquisition:
 
 @dataclass(frozen=True)
 class _Decoded:
-    """A decoded batch that is not stored yet: its chunks, the reports of its links, and its records."""
+    """A decoded batch that is not stored yet: its chunks, the reports of its links, its records, and its end."""
 
     chunk_ids: Sequence[int]
     reports: Sequence[Record]
     records: Sequence[Record]
+    until: Stamp | None
+
+
+def _end(captures: Sequence[Capture]) -> Stamp | None:
+    return captures[-1].stamp if captures else None
 
 
 def _tell_of_links(reports: Iterable[Record]) -> None:

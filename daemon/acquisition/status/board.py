@@ -12,6 +12,7 @@ from daemon.acquisition.link_intake import LinkIntake
 from daemon.acquisition.status.decode_failures import FailureCounter
 from daemon.acquisition.status.present import (
     NOTHING_EXPECTED,
+    SILENT,
     Expected,
     ExpectedChannel,
     ExpectedStation,
@@ -95,6 +96,7 @@ class StatusBoard:
         self._events: dict[tuple[str, str], tuple[int, DeviceEvent]] = {}
         self._event_count = 0
         self._error: str | None = None
+        self._decoded_until: Stamp | None = None
 
     def set_error(self, error: str | None) -> None:
         """Set why nothing can be stored; None when it can again."""
@@ -119,9 +121,15 @@ class StatusBoard:
             if captures:
                 self._lags_ns.append(now_ns - min(capture.stamp.monotonic_ns for capture in captures))
 
-    def recorded(self, records: Sequence[Record]) -> None:
-        """Note the newest readings, fixes and events of records that have just been stored."""
+    def recorded(self, records: Sequence[Record], until: Stamp | None = None) -> None:
+        """Note the newest readings, fixes and events of records that have just been stored.
+
+        Args:
+            records: the records.
+            until: all captures up to this time have been decoded; None if no time has passed.
+        """
         with self._lock:
+            self._decoded_until = until or self._decoded_until
             self._failures.tell_time(self._clock.monotonic_ns())
             decoded: list[str] = []
             malformed = Status.MALFORMED
@@ -234,6 +242,7 @@ class StatusBoard:
             last_status=last,
             link=expected.link,
             kind=expected.kind,
+            is_silent=self._is_silent(last, age_s, expected.timeout_s, links.get(expected.link), now),
         )
 
     def _station(self, name: str, links: Mapping[str, LinkStatus], now: Stamp) -> StationStatus:
@@ -254,7 +263,19 @@ class StatusBoard:
             good_age_s=None if good is None else _age_s(good.stamp, now),
             tilt_ok=None if fix is None else fix.tilt_ok,
             sentence=station_sentence(status, age_s, last_lock, last or "", reason),
+            is_silent=self._is_silent(last, age_s, expected.timeout_s, links.get(name), now),
         )
+
+    def _is_silent(
+        self, last: str | None, age_s: float | None, timeout_s: float, link: LinkStatus | None, now: Stamp
+    ) -> bool:
+        """Return True if a device was silent when the newest capture that has been decoded was received."""
+        if self._decoded_until is None:
+            return False
+        undecoded_s = max(0.0, _age_s(self._decoded_until, now))
+        link_up, since_s = _open(link)
+        then_s = None if age_s is None else age_s - undecoded_s
+        return present_status(last, then_s, timeout_s, link_up, since_s - undecoded_s) == SILENT
 
     def _per_s(self, link: str, now: Stamp) -> float:
         """Return a link's recent captures per second, up to now: while all links are silent there are no batches."""

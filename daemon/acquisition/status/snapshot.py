@@ -81,6 +81,7 @@ class ChannelStatus:
         last_status: status of its last reading, however old; None if there was none.
         link: link from which it is read; "" if it is not a channel of the rig.
         kind: joint or signal.
+        is_silent: its timeout has passed without a reading, and no reading waits to be stored or decoded.
     """
 
     name: str
@@ -91,6 +92,7 @@ class ChannelStatus:
     last_status: str | None = None
     link: str = ""
     kind: Kind = "signal"
+    is_silent: bool = False
 
 
 @dataclass(frozen=True)
@@ -109,6 +111,7 @@ class StationStatus:
         good_age_s: time since its last good fix; None if there was none.
         tilt_ok: whether its last fix reports the compensator as working and in range; None if it does not report this.
         sentence: summary of the state in one clause, for people.
+        is_silent: its timeout has passed without a record, and no record waits to be stored or decoded.
     """
 
     name: str
@@ -122,6 +125,7 @@ class StationStatus:
     good_age_s: float | None = None
     tilt_ok: bool | None = None
     sentence: str = ""
+    is_silent: bool = False
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from daemon.acquisition.status.present import SILENT, is_present
+from daemon.acquisition.status.present import is_present
 from daemon.acquisition.status.snapshot import ChannelStatus
 from daemon.alarms.alarm import Finding, rule
 from daemon.alarms.evidence import Evidence
@@ -110,7 +110,7 @@ def _is_quiet(evidence: Evidence, link: str, channels: list[ChannelStatus]) -> b
 
     Other channels may have longer timeouts; they will be silent soon.
     """
-    silent = [channel for channel in channels if channel.status == SILENT]
+    silent = [channel for channel in channels if channel.is_silent]
     if len(channels) < 2 or not silent:
         return False
     heard_s = [f.age_s for f in evidence.acquisition.frames if f.link == link and f.age_s is not None]
@@ -128,7 +128,7 @@ def _silent(evidence: Evidence, kind: str) -> Iterator[Finding]:
         if _is_quiet(evidence, link, channels):
             continue
         for channel in channels:
-            if channel.kind == kind and channel.status == SILENT and _has_started(evidence, channel):
+            if channel.kind == kind and channel.is_silent and _has_started(evidence, channel):
                 is_new = channel.last_status is None
                 text = "not received since the start" if is_new else f"no longer received (last: {channel.last_status})"
                 yield channel.name, f"{channel.name} is {text}"

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from daemon.acquisition.status.present import SILENT, is_present
+from daemon.acquisition.status.present import is_present
 from daemon.alarms.alarm import Finding, rule
 from daemon.alarms.evidence import Evidence
 from daemon.sessions.prisms.standstill_places import ELSEWHERE
-from drivers.readings import EventKind, GapReason, LockState
+from drivers.readings import EventKind, LockState
 
 _TURNED_AWAY = (LockState.STANDBY, LockState.SEARCHING, LockState.WAITING, LockState.ROTATING)
 
@@ -25,11 +25,8 @@ def station_silent(evidence: Evidence) -> Iterator[Finding]:
     A warning while no session is open. Cleared 3 s after it sends again. Not raised while the station's link is closed,
     which has its own alarm.
     """
-    # The status is also silent while fixes wait for a busy computer; a gap opens only once all captures are decoded.
-    speaks = {link.name for link in evidence.acquisition.links if link.captures_per_s > 0.0}
-    gaps = {gap.channel for gap in evidence.acquisition.gaps if gap.reason == GapReason.SILENT}
     for station in evidence.acquisition.stations:
-        if station.status == SILENT and (station.name in gaps or station.name not in speaks):
+        if station.is_silent:
             yield station.name, "the station sends no records", "warning" if evidence.session is None else "critical"
 
 
@@ -73,7 +70,7 @@ def instrument_error(evidence: Evidence) -> Iterator[Finding]:
     the station is silent, which has its own alarm.
     """
     good_s = {station.name: station.good_age_s for station in evidence.acquisition.stations}
-    silent = {station.name for station in evidence.acquisition.stations if station.status == SILENT}
+    silent = {station.name for station in evidence.acquisition.stations if station.is_silent}
     for event in evidence.active_events(EventKind.INSTRUMENT_ERROR):
         since = good_s.get(event.device)
         is_over = since is not None and since < event.age_s and event.age_s > 30.0

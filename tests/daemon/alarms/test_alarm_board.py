@@ -244,10 +244,10 @@ def test_critical_alarms_come_first_and_older_ones_before_younger(tmp_path: Path
 
 def test_alarms_of_silent_devices_neither_end_nor_begin_while_the_disk_does_not_answer(tmp_path: Path) -> None:
     clock = ManualClock(at(0))
-    joint = ChannelStatus("theta1", "deg", None, "silent", 9.0, "ok", "boom", "joint")
+    joint = ChannelStatus("theta1", "deg", None, "silent", 9.0, "ok", "boom", "joint", is_silent=True)
     links = [LinkStatus("boom", up=True, since_s=99.0)]
     told: list[tuple[str, str]] = []
-    channels = [joint, replace(joint, name="theta2", status="ok", age_s=0.1)]
+    channels = [joint, replace(joint, name="theta2", status="ok", age_s=0.1, is_silent=False)]
     frames = [FrameStatus("boom", "181", "", 5, None, 0.1, None)]
     now = AcquisitionStatus(links=links, channels=channels, frames=frames)
 
@@ -271,5 +271,5 @@ def test_alarms_of_silent_devices_neither_end_nor_begin_while_the_disk_does_not_
             now = replace(seen, channels=silent, **hindrance)
             assert looked(10) == ["theta1"], hindrance
         assert ("cleared", "joint_silent") not in told
-        now = replace(seen, channels=[replace(one, status="ok") for one in seen.channels])
+        now = replace(seen, channels=[replace(one, status="ok", is_silent=False) for one in seen.channels])
         assert looked(10) == []

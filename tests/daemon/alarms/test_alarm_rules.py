@@ -16,7 +16,6 @@ from daemon.acquisition.status.snapshot import (
     ChannelStatus,
     EventStatus,
     FrameStatus,
-    GapStatus,
     LinkStatus,
     StationStatus,
 )
@@ -49,10 +48,13 @@ def channel(
     status: str = "ok", name: str = "theta1", kind: Any = "joint", last: str | None = "ok", age_s: float = 0.1
 ) -> ChannelStatus:
     value = 1.0 if status == "ok" else None
-    return ChannelStatus(name, "deg", value, status, None if last is None else age_s, last, "boom", kind)
+    return ChannelStatus(
+        name, "deg", value, status, None if last is None else age_s, last, "boom", kind, status == "silent"
+    )
 
 
 def station(status: str = "ok", lock: str = "locked", good_age_s: float | None = 0.1, **more: Any) -> StationStatus:
+    more = {"is_silent": status == "silent", **more}
     return StationStatus("station", status, lock, "", 0.1, 5, "ok", "locked", good_age_s, **more)
 
 
@@ -72,7 +74,6 @@ def known(
     error: str | None = None,
     is_behind: bool = False,
     is_write_hung: bool = False,
-    gaps: Sequence[GapStatus] = (),
     **more: Any,
 ) -> Evidence:
     acquisition = AcquisitionStatus(
@@ -82,7 +83,6 @@ def known(
         last_events=[*events],
         decoding=[*decoding],
         frames=[FrameStatus("boom", f"{i:03X}", "", 5, None, age_s, None) for i, age_s in enumerate(frames_s)],
-        gaps=[*gaps],
         error=error,
         is_behind=is_behind,
         is_write_hung=is_write_hung,
@@ -104,8 +104,6 @@ def failures(lately: int, share: float) -> DecodeStatus:
     return DecodeStatus("theta1", 500, "the frame has 3 bytes, the value needs 4", 400, lately, share)
 
 
-SPEAKING = link(name="station", captures_per_s=5.0)
-STATION_GAP = GapStatus("station", "silent", 0, 40.0)
 SILENT = channel("silent", age_s=40)
 QUIET = channel("silent", "boom_valve", "signal", age_s=40)
 E = EventKind
@@ -210,6 +208,11 @@ CASES: dict[str, list[tuple[Evidence, list[str], Evidence]]] = {
     ],
     "joint_silent": [
         (
+            known(channels=[SILENT, channel(name="theta3")]),
+            ["theta1"],
+            known(channels=[replace(SILENT, is_silent=False), channel(name="theta3")]),  # its frames wait for the disk
+        ),
+        (
             known(channels=[SILENT, QUIET, channel(name="theta3"), channel("silent", "theta4", last=None)]),
             ["theta1", "theta4"],
             known(),
@@ -240,14 +243,9 @@ CASES: dict[str, list[tuple[Evidence, list[str], Evidence]]] = {
     ],
     "station_silent": [
         (
-            known(stations=[station("silent", "unknown")], gaps=[STATION_GAP]),
+            known(stations=[station("silent", "unknown")]),
             ["station"],
-            known(stations=[station("silent", "unknown")], links=[link(), SPEAKING]),  # its fixes wait to be decoded
-        ),
-        (
-            known(stations=[station("silent", "unknown")], links=[link(), link(name="station")], is_behind=True),
-            ["station"],  # nothing of it waits, and what does is of others
-            known(),
+            known(stations=[station("silent", "unknown", is_silent=False)]),  # its fixes wait to be decoded
         ),
     ],
     "station_not_locked": [
@@ -409,7 +407,7 @@ def test_nothing_known_raises_nothing() -> None:
 
 
 def test_a_full_disk_does_not_send_anyone_to_the_cables_of_devices_that_are_not_decoded_meanwhile() -> None:
-    quiet: dict[str, Any] = {"channels": [SILENT, QUIET], "frames_s": [40.0], "gaps": [STATION_GAP]}
+    quiet: dict[str, Any] = {"channels": [SILENT, QUIET], "frames_s": [40.0]}
     quiet["stations"] = [station("silent", "unknown")]
     alone = known(channels=[SILENT, channel(name="theta3"), QUIET], error="disk full")
     assert {a.kind for rule in library() for a in rule(known(**quiet))} == {"link_silent", "station_silent"}
@@ -419,7 +417,7 @@ def test_a_full_disk_does_not_send_anyone_to_the_cables_of_devices_that_are_not_
 
 def test_a_silent_station_is_one_alarm_although_it_did_not_answer_a_command() -> None:
     unanswered = event(E.INSTRUMENT_ERROR, "station")
-    silent = known(unanswered, stations=[station("silent", "unknown", good_age_s=30)], gaps=[STATION_GAP])
+    silent = known(unanswered, stations=[station("silent", "unknown", good_age_s=30)])
     assert [a.kind for rule in library() for a in rule(silent)] == ["station_silent"]
 
 
@@ -441,7 +439,7 @@ def test_an_unplugged_bus_is_one_alarm_and_so_is_a_bus_that_is_cut_beyond_the_ad
 
 def test_a_station_that_is_away_between_sessions_is_a_warning_and_in_one_critical() -> None:
     cases: tuple[dict[str, Any], ...] = (
-        {"stations": [station("silent", "unknown")], "gaps": [STATION_GAP]},
+        {"stations": [station("silent", "unknown")]},
         {"links": [link(), link(False, "station")], "stations": [station("link_down", "unknown")]},
     )
     for wrong in cases:

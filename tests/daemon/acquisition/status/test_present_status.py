@@ -106,6 +106,22 @@ def test_a_channel_that_was_never_heard_is_there_and_silent(rig: Rig) -> None:
     assert rig.channel("theta3") == ("silent", None)
 
 
+def test_a_device_is_silent_only_once_nothing_of_it_can_wait_for_the_disk(rig: Rig) -> None:
+    def silent() -> list[str]:
+        status = rig.status()
+        return [device.name for device in (*status.channels, *status.stations) if device.is_silent]
+
+    rig.hear(UP, frame(7, 0.0))
+    wait_until(lambda: rig.status().stations[0].fixes == 1)
+    with rig.store.transaction():  # the disk writes nothing of acquisition meanwhile
+        rig.clock.advance(40.0)
+        assert [device.status for device in (*rig.status().channels, *rig.status().stations)] == ["silent"] * 3
+        assert silent() == []
+    wait_until(lambda: silent() == ["theta1", "theta3", "ts1"])
+    rig.hear(frame(8, 40.0))
+    assert silent() == ["theta3", "ts1"]
+
+
 def test_channels_of_an_unplugged_bus_are_not_ok(rig: Rig) -> None:
     rig.hear(UP, frame(7, 0.0))
     rig.clock.advance(0.1)
