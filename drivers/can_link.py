@@ -291,11 +291,13 @@ class _Session:
         began = self._clock.of_host(read.began)
         if sent and read.batch.is_last:
             self._emit_sent(began)
+        reports: list[DeviceEvent | Gap] = []
         if doubtful:
-            self._late.add(doubtful, NOT_READ_IN_TIME if is_late else CLOCK_WAS_SET)
+            reports = self._late.add(now, doubtful, NOT_READ_IN_TIME if is_late else CLOCK_WAS_SET)
         elif not is_late:
-            for item in self._late.in_time(now):
-                emit(item)
+            reports = self._late.in_time(now)
+        for report in reports:
+            emit(report)
         if self._setup.is_active:
             for (frame, _), stamp in zip(read.batch.received, stamps, strict=True):
                 self._setup.feed(frame, stamp)

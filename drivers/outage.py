@@ -8,7 +8,7 @@ from drivers.clock import Stamp
 from drivers.readings import DeviceEvent, EventKind, Gap, GapReason, LinkItem
 
 BACKOFF_FIRST_S = 0.5
-BACKOFF_MAX_S = 1.5  # a device that is back is read within 2 s, even if nothing signals its return
+BACKOFF_MAX_S = 0.7  # an slcan adapter that takes 1.2 s to open is read within 2 s, even if nothing signals its return
 
 
 class Backoff:

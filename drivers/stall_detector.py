@@ -64,13 +64,21 @@ class LateReport:
         self._link = link
         self._what = what
         self._in_time = start  # the last instant at which nothing was doubtful
+        self._first = start  # when the first of those that are not reported yet was read
         self._count = 0
         self._reason = ""
 
-    def add(self, count: int, reason: str) -> None:
-        """Add `count` frames or bytes that were marked as doubtful because of `reason`."""
+    def add(self, now: Stamp, count: int, reason: str) -> list[DeviceEvent | Gap]:
+        """Add `count` frames or bytes, read at `now`, that were marked as doubtful because of `reason`.
+
+        Returns:
+            The report if one is due: a link that is never read in time reports too.
+        """
+        if not self._count:
+            self._first = now
         self._count += count
         self._reason = reason
+        return self.end(now) if now.since(self._first) >= _REPORT_NS else []
 
     def in_time(self, now: Stamp) -> list[DeviceEvent | Gap]:
         """Note that the data read at `now` was read in time; return the report if one is due."""

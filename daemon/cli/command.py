@@ -21,6 +21,7 @@ from calibration.errors import DataError, ModelError, RigError, UnsafeError
 from daemon.cli.terminal import echo_error, percent
 from daemon.commands import CommandError
 from daemon.host.safe_output import json_line, shown, shown_lines
+from daemon.host.systemd import escape_unhandled_records
 from drivers.errors import DescriptionError
 
 if TYPE_CHECKING:
@@ -88,6 +89,7 @@ class Command(click.Command):
 
     def invoke(self, ctx: click.Context) -> Any:
         as_json = bool(ctx.params.get("as_json"))
+        escape_unhandled_records()
         try:
             # The output of a library must not get into the result.
             with contextlib.redirect_stdout(sys.stderr) if as_json else contextlib.nullcontext():

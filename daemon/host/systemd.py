@@ -74,6 +74,12 @@ def set_up_logging(*, level: int = logging.INFO, is_prefixed: bool | None = None
     threading.excepthook = log_thread_end
 
 
+def escape_unhandled_records() -> None:
+    """Escape log records that no handler takes, such as warnings of libraries in a command that sets up no logging."""
+    assert logging.lastResort is not None
+    logging.lastResort.setFormatter(LineFormatter(is_prefixed=is_journal(sys.stderr)))
+
+
 def is_journal(stream: TextIO) -> bool:
     """Return True if a stream goes to the journal: it is the one that JOURNAL_STREAM names (systemd.exec(5))."""
     try:

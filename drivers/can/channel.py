@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import Protocol
 
 from drivers.clock import Stamp
+from drivers.jumps import JumpWatch
 from drivers.readings import DecodeFailure, Reading, Record, Status
 
 
@@ -32,7 +33,9 @@ class ChannelDecoder(Protocol):
         """Return the records of one frame sampled at `stamp`; a doubtful stamp is not used to check for jumps."""
 
 
-def too_short(name: str, unit: str, stamp: Stamp, data: bytes, needed_bits: int) -> list[Record]:
+def too_short(
+    name: str, unit: str, stamp: Stamp, data: bytes, needed_bits: int, jumps: JumpWatch | None
+) -> list[Record]:
     """Return the records of a frame that is too short for the channel's value.
 
     Args:
@@ -41,7 +44,10 @@ def too_short(name: str, unit: str, stamp: Stamp, data: bytes, needed_bits: int)
         stamp: when the frame was received.
         data: data of the frame.
         needed_bits: number of bits that the value needs.
+        jumps: the watch of a joint, for which the frame is a sample without a position.
     """
+    if jumps is not None:
+        jumps.bad(stamp)
     reason = f"the frame has {len(data)} bytes, the value needs {(needed_bits + 7) // 8}"
     return [DecodeFailure(name, stamp, reason, data), Reading(name, stamp, None, unit, Status.MALFORMED)]
 

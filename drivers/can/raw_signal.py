@@ -165,14 +165,17 @@ class SignalDecoder:
         if multiplexing is not None:
             selected = multiplexing.selector.extract(data)
             if selected is None:
-                return records + too_short(self.name, self._unit, stamp, data, multiplexing.selector.end_bit)
+                return records + self._too_short(stamp, data, multiplexing.selector.end_bit)
             if selected not in multiplexing.values:
                 return records
         unsigned = self._field.extract(data)
         if unsigned is None:
-            return records + too_short(self.name, self._unit, stamp, data, self._field.end_bit)
+            return records + self._too_short(stamp, data, self._field.end_bit)
         reading = self._reading(stamp, unsigned)
         return records + (checked_reading(self._jumps, reading) if self._jumps is not None else [reading])
+
+    def _too_short(self, stamp: Stamp, data: bytes, needed_bits: int) -> list[Record]:
+        return too_short(self.name, self._unit, stamp, data, needed_bits, self._jumps)
 
     def _reading(self, stamp: Stamp, unsigned: int) -> Reading:
         channel = self._channel

@@ -134,11 +134,6 @@ class _PositionDecoder(PdoChannelDecoder):
         super().node_restarted()
         self._flags = dict.fromkeys(_FLAGS, 0)
 
-    def _too_short(self, stamp: Stamp, data: bytes, needed_bits: int) -> list[Record]:
-        if self._jumps is not None:
-            self._jumps.bad(stamp)
-        return super()._too_short(stamp, data, needed_bits)
-
     def _take_flags(self, stamp: Stamp, index: int, flags: int, name: str, records: list[Record]) -> None:
         """Add an event to `records` if the alarms or warnings have changed."""
         if flags != self._flags[index]:

@@ -18,6 +18,7 @@ from drivers.canopen.cia301 import tpdo_id
 from drivers.clock import Stamp
 from drivers.errors import DescriptionError
 from drivers.files import read_whole
+from drivers.jumps import JumpWatch
 from drivers.readings import DeviceEvent, Record
 
 _FILE_MAX_BYTES = 2 << 20
@@ -205,6 +206,7 @@ class PdoChannelDecoder:
         self.timeout_s = channel.timeout_s
         self.is_void = False
         self._unit = channel.unit
+        self._jumps: JumpWatch | None = None
 
     def object_read(self, stamp: Stamp, index: int, value: int) -> list[Record]:  # noqa: ARG002 - profiles use them
         """Return the records caused by an object of the node that was read over SDO.
@@ -225,7 +227,7 @@ class PdoChannelDecoder:
         self.is_void = False
 
     def _too_short(self, stamp: Stamp, data: bytes, needed_bits: int) -> list[Record]:
-        return too_short(self.name, self._unit, stamp, data, needed_bits)
+        return too_short(self.name, self._unit, stamp, data, needed_bits, self._jumps)
 
 
 def _import(path: Path, node: int) -> ObjectDictionary:

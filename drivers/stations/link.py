@@ -99,10 +99,11 @@ class StationLink:
             self._last_read = stamp = self._clock.now()
             if is_late := stalls.is_late(stamp, timeout_s):
                 stamp = stamp.doubted()
-                late.add(len(data), NOT_READ_IN_TIME)
+                reports = late.add(stamp, len(data), NOT_READ_IN_TIME)
             else:
-                for item in late.in_time(stamp):
-                    emit(item)
+                reports = late.in_time(stamp)
+            for report in reports:
+                emit(report)
             if data:
                 capture = SerialCapture(self.name, stamp, data)
                 emit(capture)

@@ -5,11 +5,13 @@ import logging
 import os
 import pty
 import re
+import shutil
 import sqlite3
 import subprocess
 import sys
 import unicodedata
 from collections.abc import Callable, Iterator
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +35,14 @@ from tests.daemon.support.idle_daemon import idle_daemon
 from tests.daemon.support.jobs import SOURCE
 from tests.daemon.support.report_inputs import report_input
 
+CONFIG = """
+rig = "{rig}"
+
+[[can]]
+name = "boom"
+interface = "socketcan"
+channel = "can0"
+"""
 CLI = Path(main.callback.__code__.co_filename).parent if main.callback is not None else Path()
 # Printable: taken as they are, and shown so.
 MARKUP = {
@@ -282,6 +292,24 @@ def test_names_in_files_reach_errors_as_plain_text(tmp_path: Path, name: str) ->
         said = CliRunner().invoke(main, command)
         assert said.exit_code in {1, 2}, said.output
         assert_plain(said.output)
+
+
+def test_a_library_that_warns_of_a_name_in_a_file_writes_plain_text(tmp_path: Path) -> None:
+    rigs = Path(str(resources.files("calibration").joinpath("rigs")))
+    shutil.copytree(rigs, tmp_path, dirs_exist_ok=True)
+    name = "".join(name for name in ANY.values() if name.splitlines() == [name])
+    unknown = f"\n[2000]\nParameterName={name}\nObjectType=0x7\nDataType=0x99\nAccessType=ro\n"
+    eds = (rigs / "cia406.eds").read_text(encoding="latin-1") + unknown
+    (tmp_path / "encoder.eds").write_text(eds, encoding="utf-8")
+    rig = (rigs / "swdt82.toml").read_text(encoding="utf-8")
+    (tmp_path / "rig.toml").write_text(rig.replace("node = 32\n", 'node = 32\neds = "encoder.eds"\n'), encoding="utf-8")
+    config = tmp_path / "rigcal.toml"
+    config.write_text(CONFIG.format(rig=tmp_path / "rig.toml"), encoding="utf-8")
+    command = [sys.executable, "-m", "daemon.cli.main", "config", "check", str(config)]
+    done = subprocess.run(command, capture_output=True, check=False, encoding="utf-8")
+    assert done.returncode == 0, done.stderr
+    assert "unsupported data type" in done.stderr
+    assert_plain(done.stderr)
 
 
 def test_file_names_that_are_no_unicode_are_named_all_the_same(tmp_path: Path) -> None:

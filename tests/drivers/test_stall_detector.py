@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import threading
+import time
 from pathlib import Path
 
 import pytest
 
-from drivers.clock import NS_PER_S, ScaledClock, Stamp
-from drivers.readings import DeviceEvent, EventKind, Fix, Gap, GapReason, Status
+from drivers.clock import NS_PER_S, ScaledClock, Stamp, SystemClock
+from drivers.readings import DeviceEvent, EventKind, Fix, Gap, GapReason, LinkItem, SerialCapture, Status
 from drivers.stall_detector import CLOCK_WAS_SET, LATE_S, NOT_READ_IN_TIME, LateReport, StallDetector
 from drivers.stations.decoder import StationDecoder
+from drivers.stations.link import StationLink
 from drivers.stations.survey import position_mm
-from tests.drivers.can_support import START
+from tests.drivers.can_support import DEADLINE_S, START
 from tests.drivers.serial_support import ACK_FRAME, plugged_in, running, tracking_record
 from tests.drivers.stations.test_station_link import config
 from tests.drivers.stopped_clock import AWAY_S, StoppedClock
@@ -114,13 +117,53 @@ def test_doubts_are_told_once_a_second_at_most_and_once_more_at_the_end() -> Non
         return START.shifted(round(seconds * NS_PER_S))
 
     assert report.in_time(at(10.0)) == []
-    report.add(2, NOT_READ_IN_TIME)
+    assert report.add(at(10.2), 2, NOT_READ_IN_TIME) == []
     assert report.in_time(at(10.5)) == []
-    report.add(3, CLOCK_WAS_SET)
+    assert report.add(at(10.9), 3, CLOCK_WAS_SET) == []
     event, gap = report.in_time(at(11.1))
     assert isinstance(event, DeviceEvent)
     assert event.code == 5
     assert gap == Gap("boom", GapReason.TIME_DOUBTFUL, at(10.0), at(11.1))
     assert report.in_time(at(20.0)) == report.end(at(20.5)) == []
-    report.add(1, NOT_READ_IN_TIME)
+    assert report.add(at(20.7), 1, NOT_READ_IN_TIME) == []
     assert report.end(at(21.0))[1] == Gap("boom", GapReason.TIME_DOUBTFUL, at(20.5), at(21.0))
+
+
+def test_a_link_that_is_never_read_in_time_is_told_while_that_lasts(tmp_path: Path) -> None:
+    path = tmp_path / "tty"
+    stop, reported = threading.Event(), threading.Event()
+    items: list[LinkItem] = []
+
+    def emit(item: LinkItem) -> None:
+        items.append(item)
+        if isinstance(item, DeviceEvent) and item.kind is EventKind.TIME_DOUBTFUL:
+            reported.set()
+        if isinstance(item, SerialCapture):
+            stop.wait(0.9)  # as a thread that gets no processor time meanwhile
+
+    with plugged_in(path) as instrument:
+        link = threading.Thread(
+            target=StationLink(config(path, profile="passive"), SystemClock()).run, args=(emit, stop)
+        )
+        link.start()
+        try:
+            until = time.monotonic() + 4 * DEADLINE_S
+            while not reported.wait(0.1) and time.monotonic() < until:
+                instrument.send(tracking_record())
+        finally:
+            stop.set()
+            link.join()
+    assert reported.is_set()
+    captures = [item for item in items if isinstance(item, SerialCapture)]
+    assert all(capture.stamp.is_doubtful for capture in captures[1:]), "the link was read in time"
+
+
+def test_the_report_of_what_is_late_comes_with_what_is_late_a_second_after_its_first() -> None:
+    report = LateReport("boom", "frames", START)
+    assert report.add(START.shifted(5 * NS_PER_S), 0, NOT_READ_IN_TIME) == []
+    assert report.add(START.shifted(6 * NS_PER_S), 4, NOT_READ_IN_TIME) == []
+    now = START.shifted(7 * NS_PER_S)
+    event, gap = report.add(now, 5, NOT_READ_IN_TIME)
+    assert isinstance(event, DeviceEvent)
+    assert (event.code, gap) == (9, Gap("boom", GapReason.TIME_DOUBTFUL, START, now))
+    assert report.add(now.shifted(NS_PER_S // 2), 1, NOT_READ_IN_TIME) == []

@@ -20,6 +20,7 @@ from daemon.acquisition.status.present import (
     present_status,
     station_sentence,
 )
+from daemon.acquisition.status.recent_counts import RecentCounts
 from daemon.acquisition.status.snapshot import (
     AcquisitionStatus,
     ChannelStatus,
@@ -40,6 +41,7 @@ from drivers.readings import (
     EventKind,
     Fix,
     Gap,
+    GapReason,
     LockState,
     Reading,
     Record,
@@ -89,11 +91,12 @@ class StatusBoard:
         self._good_fixes: dict[str, Fix] = {}
         self._fix_counts: Counter[str] = Counter()
         self._failures = FailureCounter()
+        self._lately_missed = RecentCounts()
         self._gaps: dict[tuple[str, str], Gap] = {}
         self._gap_counts: Counter[tuple[str, str]] = Counter()
         self._missed: Counter[tuple[str, str]] = Counter()
         self._event_counts: Counter[tuple[str, str]] = Counter()
-        self._events: dict[tuple[str, str], tuple[int, DeviceEvent]] = {}
+        self._events: dict[tuple[str, str, bool], tuple[int, DeviceEvent]] = {}
         self._event_count = 0
         self._error: str | None = None
         self._decoded_until: Stamp | None = None
@@ -109,7 +112,7 @@ class StatusBoard:
             for event in events:
                 if event.device in self._channels:
                     self._event_count += 1
-                    self._events[event.device, event.kind] = self._event_count, event
+                    self._events[_place(event)] = self._event_count, event
 
     def captured(self, captures: Sequence[Capture]) -> None:
         """Count captures that have just been stored, by link, and note how long the oldest one has waited."""
@@ -130,7 +133,7 @@ class StatusBoard:
         """
         with self._lock:
             self._decoded_until = until or self._decoded_until
-            self._failures.tell_time(self._clock.monotonic_ns())
+            self._tell_time(self._clock.monotonic_ns())
             decoded: list[str] = []
             malformed = Status.MALFORMED
             for record in records:
@@ -152,6 +155,10 @@ class StatusBoard:
                     self._note_gap(record)
             self._failures.decoded.update(decoded)
 
+    def _tell_time(self, now_ns: int) -> None:
+        self._failures.tell_time(now_ns)
+        self._lately_missed.tell_time(now_ns)
+
     def _note_gap(self, gap: Gap) -> None:
         key = gap.channel, gap.reason.value
         was_open = self._gaps.pop(key, None)
@@ -161,11 +168,13 @@ class StatusBoard:
             self._gap_counts[key] += 1
         if gap.end is not None:
             self._missed[key] += gap.missed or 0
+            if gap.reason is GapReason.FRAMES_LOST:
+                self._lately_missed.add(gap.channel, gap.missed or 0)
 
     def _happened(self, event: DeviceEvent) -> None:
         self._event_count += 1
         self._event_counts[event.device, event.kind.value] += 1
-        self._events[event.device, event.kind] = self._event_count, event
+        self._events[_place(event)] = self._event_count, event
         if event.kind in (EventKind.LINK_UP, EventKind.LINK_LOST):
             link = self._links.setdefault(event.device, _Link(event.stamp))
             is_up = event.kind is EventKind.LINK_UP
@@ -194,7 +203,7 @@ class StatusBoard:
         heard = {summary.link: summary for summary in summaries}
         now = self._clock.now()
         with self._lock:
-            self._failures.tell_time(now.monotonic_ns)
+            self._tell_time(now.monotonic_ns)
             lags = sorted(self._lags_ns)
             last_lag = self._lags_ns[-1] if lags else 0
             links = [self._link(intake, heard.get(intake.name), defects.get(intake.name), now) for intake in intakes]
@@ -210,10 +219,7 @@ class StatusBoard:
                 last_events=sorted(
                     (_event(number, event, now) for number, event in self._events.values()), key=lambda e: e.number
                 ),
-                gap_counts=[
-                    GapCount(channel, reason, count, self._missed[channel, reason])
-                    for (channel, reason), count in self._gap_counts.items()
-                ],
+                gap_counts=[self._gap_count(*key) for key in self._gap_counts],
                 event_counts=[EventCount(device, kind, count) for (device, kind), count in self._event_counts.items()],
                 writer_lag_s=last_lag / NS_PER_S,
                 writer_lag_p99_s=lags[int(0.99 * (len(lags) - 1))] / NS_PER_S if lags else 0.0,
@@ -221,6 +227,17 @@ class StatusBoard:
                 is_behind=is_behind,
                 is_write_hung=is_write_hung,
             )
+
+    def _gap_count(self, channel: str, reason: str) -> GapCount:
+        lately = self._lately_missed[channel] if reason == GapReason.FRAMES_LOST else 0
+        return GapCount(
+            channel,
+            reason,
+            self._gap_counts[channel, reason],
+            self._missed[channel, reason],
+            lately,
+            lately / (lately + self._failures.decoded[channel]) if lately else 0.0,
+        )
 
     @staticmethod
     def _known(expected: Mapping[str, object], heard: Mapping[str, object]) -> list[str]:
@@ -313,6 +330,11 @@ class StatusBoard:
             restarted_age_s=None if link.restarted_at is None else _age_s(link.restarted_at, now),
             decoder_failed_age_s=None if decoder_failed is None else _age_s(decoder_failed, now),
         )
+
+
+def _place(event: DeviceEvent) -> tuple[str, str, bool]:
+    """Return the key of the events that this event replaces: what a device reports, and what rigcal says about it."""
+    return event.device, event.kind, event.kind in (EventKind.ALARM, EventKind.WARNING) and event.code is None
 
 
 def _age_s(stamp: Stamp, now: Stamp) -> float:

@@ -7,9 +7,8 @@ from collections import Counter, defaultdict
 from dataclasses import dataclass
 from functools import lru_cache
 
-from drivers.clock import NS_PER_S
+from daemon.acquisition.status.recent_counts import RecentCounts
 
-WINDOW_NS = 30 * NS_PER_S  # "lately" is the last one to two windows
 KINDS_MAX = 50  # most kinds of reasons counted per device, so that noise cannot fill the memory
 OTHER = "various reasons"
 
@@ -38,28 +37,21 @@ class DecodeStatus:
 
 
 class FailureCounter:
-    """Counts failures by device and kind of reason. For one thread, or under its owner's lock."""
+    """Counts failures by device and kind of reason. For one thread, or under its owner's lock.
+
+    Attributes:
+        decoded: number of records lately decoded of each device; the caller adds to it.
+    """
 
     def __init__(self) -> None:
         self._counts: dict[str, Counter[str]] = defaultdict(Counter)
         self._examples: dict[tuple[str, str], str] = {}
-        self._failed = Counter[str](), Counter[str]()  # in the previous window, and in the present one
-        self._decoded = Counter[str](), Counter[str]()
-        self._window_ns = 0
+        self._failed, self.decoded = RecentCounts(), RecentCounts()
 
     def tell_time(self, now_ns: int) -> None:
-        """Discard counts of windows that are over."""
-        if now_ns - self._window_ns < WINDOW_NS:
-            return
-        is_next = now_ns - self._window_ns < 2 * WINDOW_NS
-        self._failed = (self._failed[1] if is_next else Counter(), Counter())
-        self._decoded = (self._decoded[1] if is_next else Counter(), Counter())
-        self._window_ns = now_ns
-
-    @property
-    def decoded(self) -> Counter[str]:
-        """Device -> number of records decoded in this window; the caller adds to it."""
-        return self._decoded[1]
+        """Discard what is not recent any more."""
+        self._failed.tell_time(now_ns)
+        self.decoded.tell_time(now_ns)
 
     def add(self, device: str, reason: str) -> None:
         """Count a capture of a device that could not be decoded."""
@@ -69,7 +61,7 @@ class FailureCounter:
             kind = reason = OTHER
         kinds[kind] += 1
         self._examples[device, kind] = reason
-        self._failed[1][device] += 1
+        self._failed.add(device)
 
     def totals(self) -> dict[str, int]:
         """Return device -> number of failures since the start."""
@@ -81,8 +73,8 @@ class FailureCounter:
 
     def _status(self, device: str, kinds: Counter[str]) -> DecodeStatus:
         ((kind, count),) = kinds.most_common(1)
-        failed = sum(window[device] for window in self._failed)
-        heard = failed + sum(window[device] for window in self._decoded)
+        failed = self._failed[device]
+        heard = failed + self.decoded[device]
         return DecodeStatus(
             device=device,
             count=kinds.total(),

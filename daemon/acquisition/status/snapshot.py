@@ -172,12 +172,16 @@ class GapCount:
         channel, reason: as in `GapStatus`.
         count: number of gaps.
         missed: number of readings or frames missing in them, as far as known.
+        lately: how many of those are missing in the last 30 to 60 s.
+        lately_share: their share of the readings that were due in that time, 0 to 1.
     """
 
     channel: str
     reason: str
     count: int
     missed: int
+    lately: int = 0
+    lately_share: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 from daemon.acquisition.status.present import is_present
+from daemon.acquisition.status.snapshot import EventStatus
 from daemon.alarms.alarm import Finding, rule
 from daemon.alarms.evidence import Evidence
 from drivers.readings import EventKind
@@ -71,11 +72,9 @@ def device_alarm(evidence: Evidence) -> Iterator[Finding]:
     Cleared when the device reports that the alarm is gone, or boots. After a failed set-up, cleared when a set-up
     succeeds.
     """
-    set_up = {event.device for event in evidence.active_events(EventKind.ALARM, EventKind.CONFIGURED)}
-    for event in evidence.active_events(EventKind.ALARM, EventKind.BOOT_UP):
-        is_mended = event.code is None and event.device not in set_up
-        if not is_mended and not evidence.is_cut_off(event.device):
-            yield event.device, event.text
+    since_set_up = evidence.active_events(EventKind.ALARM, EventKind.CONFIGURED)
+    active = evidence.active_events(EventKind.ALARM, EventKind.BOOT_UP)
+    yield from _by_device(evidence, [e for e in active if e.code is not None or e in since_set_up])
 
 
 @rule("warning", "Follow the text of the warning. The device's values are still used.")
@@ -85,8 +84,21 @@ def device_warning(evidence: Evidence) -> Iterator[Finding]:
     A CAN link warns while its transmit queue is full. Cleared when the device withdraws the warning or boots. A warning
     that the device cannot withdraw is cleared when the link is reopened.
     """
-    for event in evidence.active_events(EventKind.WARNING, EventKind.BOOT_UP):
-        link = evidence.link_of(event.device)
-        is_of_before = event.code is None and link is not None and link.up is True and link.since_s < event.age_s
-        if not is_of_before and not evidence.is_cut_off(event.device):
-            yield event.device, event.text
+    active = evidence.active_events(EventKind.WARNING, EventKind.BOOT_UP)
+    yield from _by_device(evidence, [event for event in active if not _is_of_before(event, evidence)])
+
+
+def _is_of_before(event: EventStatus, evidence: Evidence) -> bool:
+    """Return True if a warning that no device withdraws is older than the present opening of its link."""
+    link = evidence.link_of(event.device)
+    return event.code is None and link is not None and link.up is True and link.since_s < event.age_s
+
+
+def _by_device(evidence: Evidence, events: Sequence[EventStatus]) -> Iterator[Finding]:
+    """Yield one finding of each device: what it reports itself, and what rigcal reports about it."""
+    texts: dict[str, list[str]] = {}
+    for event in events:
+        texts.setdefault(event.device, []).append(event.text)
+    for device, told in texts.items():
+        if not evidence.is_cut_off(device):
+            yield device, "; ".join(told)

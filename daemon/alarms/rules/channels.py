@@ -135,7 +135,7 @@ def _silent(evidence: Evidence, kind: str) -> Iterator[Finding]:
 
 
 def _not_usable(evidence: Evidence, kind: str) -> Iterator[Finding]:
-    told = {event.device for event in evidence.active_events(EventKind.ALARM, EventKind.BOOT_UP)}
+    told = {event.device for event in evidence.active_events(EventKind.ALARM, EventKind.BOOT_UP) if event.code}
     told |= {
         e.device for e in evidence.active_events(EventKind.EMERGENCY, EventKind.EMERGENCY_CLEARED, EventKind.BOOT_UP)
     }

@@ -65,6 +65,19 @@ def frames_lost(evidence: Evidence) -> Iterator[Finding]:
         yield event.device, event.text
 
 
+@rule("warning", "Check the device, the bus and whether the message counter is described correctly.", hold_s=60.0)
+def frames_missing(evidence: Evidence) -> Iterator[Finding]:
+    """In about the last minute, at least 10 readings of a channel, and at least 1 %, were missing by message counter.
+
+    The frames did not reach this computer. Cleared when fewer have been missing for a minute.
+    """
+    channels = {channel.name for channel in evidence.acquisition.channels}
+    for gaps in evidence.acquisition.gap_counts:
+        is_many = gaps.lately >= 10 and gaps.lately_share >= 0.01
+        if is_many and gaps.channel in channels and not evidence.is_cut_off(gaps.channel):
+            yield gaps.channel, "frames are missing according to their message counter"
+
+
 @rule("warning", "Check what else keeps the computer busy, and whether its clock is being set while rigcal runs.")
 def time_doubtful(evidence: Evidence) -> Iterator[Finding]:
     """Within the last 5 minutes captures arrived whose time of arrival is not known.

@@ -16,6 +16,7 @@ from daemon.acquisition.status.snapshot import (
     ChannelStatus,
     EventStatus,
     FrameStatus,
+    GapCount,
     LinkStatus,
     StationStatus,
 )
@@ -74,6 +75,7 @@ def known(
     error: str | None = None,
     is_behind: bool = False,
     is_write_hung: bool = False,
+    gap_counts: Sequence[GapCount] = (),
     **more: Any,
 ) -> Evidence:
     acquisition = AcquisitionStatus(
@@ -86,6 +88,7 @@ def known(
         error=error,
         is_behind=is_behind,
         is_write_hung=is_write_hung,
+        gap_counts=[*gap_counts],
     )
     return Evidence(NOW, **{"running_s": 1000.0, "acquisition": acquisition, **more})
 
@@ -98,6 +101,10 @@ def store_health(
     state: HealthState = "ok", text: str = "", free_bytes: int | None = None, *, is_low: bool = False
 ) -> StoreHealth:
     return StoreHealth(state, text, NOW, free_bytes, is_low)
+
+
+def missing(lately: int, share: float) -> GapCount:
+    return GapCount("theta1", "frames_lost", 40, 500, lately, share)
 
 
 def failures(lately: int, share: float) -> DecodeStatus:
@@ -123,6 +130,10 @@ CASES: dict[str, list[tuple[Evidence, list[str], Evidence]]] = {
     "queue_full": [(known(links=[link(dropped_age_s=1)]), ["boom"], known(links=[link(dropped_age_s=6)]))],
     "time_doubtful": [(known(event(E.TIME_DOUBTFUL)), ["boom"], known(event(E.TIME_DOUBTFUL, age_s=301)))],
     "frames_lost": [(known(event(E.FRAMES_DROPPED)), ["boom"], known(event(E.FRAMES_DROPPED, age_s=301)))],
+    "frames_missing": [
+        (known(gap_counts=[missing(10, 0.02)]), ["theta1"], known(gap_counts=[missing(10, 0.005)])),
+        (known(gap_counts=[missing(60, 1.0)]), ["theta1"], known(gap_counts=[missing(9, 1.0)])),
+    ],
     "decode_failures": [
         (known(decoding=[failures(10, 0.02)]), ["theta1"], known(decoding=[failures(10, 0.005)])),
         (known(decoding=[failures(60, 1.0)]), ["theta1"], known(decoding=[failures(9, 1.0)])),
@@ -180,8 +191,18 @@ CASES: dict[str, list[tuple[Evidence, list[str], Evidence]]] = {
             ["theta1"],
             known(event(E.ALARM, "theta1", code=1), event(E.BOOT_UP, "theta1", 2)),
         ),
+        (  # a set-up that failed and was repeated ends nothing that the device reports itself
+            known(event(E.ALARM, "theta1", 1, code=1), event(E.ALARM, "theta1", 2), event(E.CONFIGURED, "theta1", 3)),
+            ["theta1"],
+            known(event(E.ALARM, "theta1", 2), event(E.CONFIGURED, "theta1", 3), event(E.ALARM, "theta1", 4, code=0)),
+        ),
     ],
     "device_warning": [
+        (  # what the device reports itself lasts, and is one alarm with what rigcal reports
+            known(event(E.WARNING, "theta1", 1, code=16), event(E.WARNING, "theta1", 2)),
+            ["theta1"],
+            known(event(E.WARNING, "theta1", 1, code=0), event(E.BOOT_UP, "theta1", 2)),
+        ),
         (known(event(E.WARNING, "theta1", code=16)), ["theta1"], known(event(E.WARNING, "theta1", code=0))),
         (
             known(event(E.WARNING, "station")),

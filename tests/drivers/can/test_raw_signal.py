@@ -181,6 +181,27 @@ def test_a_joint_in_raw_frames_that_jumps_behind_missing_values_is_told() -> Non
     assert the_reading(decoder.decode(at(0.06), (4300).to_bytes(2, "little"))).value == 43.0
 
 
+@pytest.mark.parametrize("is_j1939", [False, True])
+def test_a_jump_after_frames_that_were_too_short_is_told(is_j1939: bool) -> None:
+    channel = SignalChannel(
+        name="theta1",
+        unit="deg",
+        arbitration_id=0x18FF0001,
+        is_extended=True,
+        is_j1939=is_j1939,
+        field=BitField(0, 16),
+        factor=0.01,
+        max_rate_per_s=20.0,
+    )
+    decoder = SignalDecoder(channel)
+    decoder.decode(START, (1000).to_bytes(2, "little"))
+    for step in range(1, 100):
+        decoder.decode(at(0.1 * step), b"\0")  # which shows that the bus was read
+    decoder.decode(at(10.0), (1000).to_bytes(2, "little"))
+    records = decoder.decode(at(10.1), (4300).to_bytes(2, "little"))
+    assert [event.kind for event in events(records)] == [EventKind.PRESET_JUMP]
+
+
 def test_a_joint_in_raw_frames_may_pass_the_full_turn() -> None:
     decoder = SignalDecoder(
         SignalChannel(name="theta1", unit="deg", arbitration_id=0x201, field=BitField(0, 16), max_rate_per_s=20.0)

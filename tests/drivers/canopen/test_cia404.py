@@ -98,6 +98,16 @@ def test_no_bytes_make_the_decoder_raise_or_give_a_number_that_is_none(data: byt
     assert reading.value is None or math.isfinite(reading.value)
 
 
+def test_a_length_that_jumps_after_frames_that_were_too_short_is_told() -> None:
+    decoder = analogue(I16, max_rate_per_s=20.0)
+    decoder.decode(START, struct.pack("<h", 1000))
+    for step in range(1, 100):
+        decoder.decode(at(0.1 * step), b"\0")  # which shows that the bus was read
+    decoder.decode(at(10.0), struct.pack("<h", 1000))
+    records = decoder.decode(at(10.1), struct.pack("<h", 0))
+    assert [event.kind for event in events(records)] == [EventKind.PRESET_JUMP]
+
+
 def test_a_length_that_jumps_behind_an_emergency_is_told() -> None:
     decoder = analogue(I16, max_rate_per_s=500.0)
     decoder.decode(START, struct.pack("<h", 1000))

@@ -245,7 +245,7 @@ def test_failures_of_late_are_a_share_of_what_came_and_are_forgotten() -> None:
     failures.tell_time(100 * NS_PER_S)
     for _ in range(10):
         failures.add("theta1", "too short")
-    failures.decoded["theta1"] += 90
+    failures.decoded.add("theta1", 90)
     (status,) = failures.status()
     assert (status.lately, status.lately_share) == (10, pytest.approx(0.1))
     failures.tell_time(131 * NS_PER_S)
