@@ -179,8 +179,9 @@ def _joint_line(joint: Mapping[str, Any]) -> str:
 def _hold_line(guide: Mapping[str, Any]) -> str:
     hold, poses = guide["hold"], guide["poses"]
     stands = "moves" if hold["since_s"] is None else f"stands for {hold['since_s']:.0f} s"
+    boom = f"The boom {stands}" if hold["is_known"] else "The joints are not read now"
     return (
-        f"The boom {stands}; {hold['fixes']} of {hold['needed_fixes']} fixes; {poses['done']} of {poses['planned']} "
+        f"{boom}; {hold['fixes']} of {hold['needed_fixes']} fixes; {poses['done']} of {poses['planned']} "
         f"poses of prism {guide['prism']}"
     )
 

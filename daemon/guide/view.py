@@ -108,7 +108,8 @@ def _kind(rig: Rig, job: Job, around: Around) -> str:
     target = _target(job)
     if target is None:
         return "enough"
-    return "hold" if around.boom.values and is_there(rig, around.boom.values, target.joints) else "go_to_pose"
+    boom = around.boom
+    return "hold" if boom.is_fresh and is_there(rig, boom.values, target.joints) else "go_to_pose"
 
 
 def _step(rig: Rig, job: Job, around: Around) -> dict[str, Any]:
@@ -239,6 +240,7 @@ def _hold(rig: Rig, pose: PlannedPose, around: Around) -> dict[str, Any]:
     found = around.standstill
     fixes = found.fixes if found is not None and is_there(rig, joints_of(rig, found), pose.joints) else 0
     return {
+        "is_known": around.boom.is_fresh,
         "since_s": around.boom.stands_s,
         "needed_s": around.settle_s,
         "fixes": fixes,

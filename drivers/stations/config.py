@@ -9,6 +9,7 @@ from drivers.stations.profile import Codec, ProfileOptions, StationProfile
 from drivers.stations.profiles import codecs_by_family, station_profiles
 from drivers.stations.replies import ReplyReader
 from drivers.stations.serial_port import SerialConfig
+from drivers.stations.survey import RANGE_MAX_M
 
 
 class StationConfig(ProfileOptions, PollTiming):
@@ -42,7 +43,7 @@ class StationConfig(ProfileOptions, PollTiming):
     max_speed_m_s: float = Field(default=5.0, gt=0)
     jump_slack_m: float = Field(default=0.1, gt=0)
     relock_within_m: float = Field(default=2.0, gt=0)
-    max_range_m: float = Field(default=6000.0, ge=1)
+    max_range_m: float = Field(default=RANGE_MAX_M, ge=1)
     silence_timeout_s: float = Field(default=4.0, ge=0)
 
     @model_validator(mode="before")

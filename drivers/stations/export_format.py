@@ -13,7 +13,7 @@ from typing import Literal, NoReturn
 from pydantic import BaseModel, ConfigDict, Field
 
 from drivers.errors import DescriptionError
-from drivers.stations.survey import METRES_PER_FOOT
+from drivers.stations.survey import METRES_PER_FOOT, RANGE_MAX_M
 
 LengthUnit = Literal["mm", "cm", "m", "in", "ft"]
 AngleUnit = Literal["deg", "gon", "rad"]
@@ -124,10 +124,30 @@ class ExportFormat:
     passed_over: Callable[[str, str], tuple[str, ...]] = lambda _text, _source: ()
 
 
-def polar_position_mm(hz_rad: float, zenith_rad: float, distance_mm: float) -> tuple[float, float, float]:
-    """Return east, north, up in mm from horizontal angle (clockwise from north), zenith angle and slope distance."""
+def polar_position_mm(
+    hz_rad: float, zenith_rad: float, distance_mm: float, source: str, line: int
+) -> tuple[float, float, float]:
+    """Return east, north, up in mm from horizontal angle (clockwise from north), zenith angle and slope distance.
+
+    Raises:
+        DescriptionError: the distance is none that a total station measures; names `source` and `line`.
+    """
+    if not 0.0 < distance_mm <= 1000.0 * RANGE_MAX_M:
+        said = f"the distance {distance_mm / 1000:g} m is not between 0 and {RANGE_MAX_M:g} m"
+        refuse(source, f"{said}: nothing was measured, or the unit is wrong; correct or remove the line", line)
     level_mm = distance_mm * math.sin(zenith_rad)
     return level_mm * math.sin(hz_rad), level_mm * math.cos(hz_rad), distance_mm * math.cos(zenith_rad)
+
+
+def measured_mm(place_mm: tuple[float, float, float], source: str, line: int) -> tuple[float, float, float]:
+    """Return coordinates unless all of them are exactly zero, which is how programs write that nothing was measured.
+
+    Raises:
+        DescriptionError: all three are zero; names `source` and `line`.
+    """
+    if place_mm == (0.0, 0.0, 0.0):
+        refuse(source, "all coordinates are zero: nothing was measured; remove the line", line)
+    return place_mm
 
 
 def refuse(source: str, reason: str, line: int | None = None, column: str | int | None = None) -> NoReturn:

@@ -10,6 +10,9 @@ from drivers.readings import Fix, Status
 # International foot. (The US survey foot is 2 ppm longer: 0.2 mm in 100 m.)
 METRES_PER_FOOT = 0.3048
 
+# The longest distance that the distance meters of these families measure to a single prism under good conditions
+RANGE_MAX_M = 6000.0
+
 # Horizontal and slope distance of one record may differ from SD * sin(V) by curvature and refraction (millimetres at
 # these ranges) and rounding. A larger share of SD means wrong digits that the checksum did not catch.
 HORIZONTAL_DISTANCE_TOLERANCE = 0.01

@@ -26,6 +26,7 @@ from daemon.cli.lines.state import (
 )
 from daemon.cli.lines.summary import state_sentence, summary
 from daemon.cli.terminal import Coloured, echo, echo_table
+from daemon.host.safe_output import duration
 from daemon.next_step import next_line
 
 WIDTH = 100  # if the terminal's width is unknown
@@ -54,7 +55,8 @@ def _show_all(status: Mapping[str, Any], *, frames: bool) -> None:
     for line in (*notice_lines(status["notices"]), *store_lines(status), *gap_state_lines(acquisition)):
         echo(line)
     if status["clock"] is not None:
-        echo(f"the computer's clock: {clock_sentence(status['clock'])}")
+        clock = status["clock"]
+        echo(f"the computer's clock, {duration(clock['age_s'])} ago: {clock_sentence(clock)}")
     _show_links(acquisition["links"])
     _show_channels(acquisition["channels"])
     if frames:
@@ -80,6 +82,7 @@ def _show_links(links: Sequence[Mapping[str, Any]]) -> None:
         [
             link["name"],
             state[link["up"]],
+            duration(link["since_s"]),
             str(link["captures"]),
             f"{link['captures_per_s']:.0f}",
             str(link["queued"]),
@@ -87,7 +90,8 @@ def _show_links(links: Sequence[Mapping[str, Any]]) -> None:
         ]
         for link in links
     ]
-    echo_table(("link", "state", "captures", "per s", "queued", "dropped"), rows, title="links", text_columns=(0, 1))
+    header = ("link", "state", "for", "captures", "per s", "queued", "dropped")
+    echo_table(header, rows, title="links", text_columns=(0, 1))
 
 
 def _show_channels(channels: Sequence[Mapping[str, Any]]) -> None:
@@ -111,9 +115,10 @@ def _show_frames(frames: Sequence[Mapping[str, Any]]) -> None:
             frame["names"],
             str(frame["count"]),
             "" if frame["rate_per_s"] is None else f"{frame['rate_per_s']:.0f}",
+            "" if frame["age_s"] is None else f"{frame['age_s']:.1f}",
             "" if frame["missed"] is None else str(frame["missed"]),
         ]
         for frame in frames
     ]
-    header = ("link", "identifier", "what", "frames", "per s", "missed")
+    header = ("link", "identifier", "what", "frames", "per s", "age s", "missed")
     echo_table(header, rows, title="frames", text_columns=(0, 1, 2))

@@ -33,6 +33,7 @@ from drivers.stations.export_format import (
     ExportFormat,
     Guess,
     LengthUnit,
+    measured_mm,
     polar_position_mm,
     refuse,
 )
@@ -200,6 +201,7 @@ class _Reading:
 
     def _take_coordinates(self, line: int, code: str, cells: list[str]) -> None:
         north, east, up = self._lengths_mm(cells, (1, 2, 3), line, code)
+        measured_mm((north, east, up), self.source, line)
         origin_mm = self.origin_mm
         place = (east - origin_mm[0], north - origin_mm[1], up + self.target_mm - origin_mm[2])
         self.coordinates.setdefault(self.station, line)
@@ -208,7 +210,7 @@ class _Reading:
     def _take_polar(self, line: int, code: str, cells: list[str]) -> None:
         distance, zenith, hz = (_number(cells, place, code, line, self.source) for place in (2, 3, 4))
         mm, rad = MM_PER[self.columns.length_unit], RAD_PER[self.columns.angle_unit]
-        place = polar_position_mm(hz * rad, zenith * rad, distance * mm)
+        place = polar_position_mm(hz * rad, zenith * rad, distance * mm, self.source, line)
         at = self._named(cells)
         turn_rad = self.turns_rad.get(at)
         if turn_rad is None or abs(math.remainder(turn_rad, math.tau)) > _SAME_FRAME_RAD:

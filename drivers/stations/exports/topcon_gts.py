@@ -14,7 +14,7 @@ from dataclasses import replace
 
 from drivers.clock import Stamp
 from drivers.stations.export_format import ColumnMap, ExportedFix, ExportFormat, Guess, refuse
-from drivers.stations.survey import RecordError, position_mm
+from drivers.stations.survey import RANGE_MAX_M, RecordError, position_mm, range_checked
 from drivers.stations.topcon.framing import block_check, decode_frame
 from drivers.stations.topcon.records import parse_record
 
@@ -88,6 +88,7 @@ def _fix(record: str, point: str, line: int, source: str) -> ExportedFix:
         found = parse_record(data, source, _NEVER, _NEVER)
     except RecordError as error:
         refuse(source, f"point {point}: {error}", line)
+    found = range_checked(found, RANGE_MAX_M)
     place = position_mm(found)
     if place is None:
         refuse(source, f"point {point}: {found.reason or 'the record has no position'}; remove it from the file", line)

@@ -16,7 +16,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 
-from drivers.stations.export_format import MM_PER, ColumnMap, ExportedFix, ExportFormat, Guess, refuse
+from drivers.stations.export_format import MM_PER, ColumnMap, ExportedFix, ExportFormat, Guess, measured_mm, refuse
 from drivers.stations.tables.cells import (
     WHOLE,
     Numbers,
@@ -97,7 +97,8 @@ def _read(text: str, columns: ColumnMap, source: str) -> list[ExportedFix]:
                     said = "the cell is empty; a marker must have all three coordinates, or none if it was not seen"
                     refuse(source, said, number, f"{marker} {axis}")
             x, y, z = (mm * numbers.read(cell, number, f"{marker} {axis}") for axis, cell in own.items())
-            fixes.append(ExportedFix(number, f"{frame:.0f}", marker, (x, y, z), frame / columns.rate_hz))
+            place = measured_mm((x, y, z), source, number)
+            fixes.append(ExportedFix(number, f"{frame:.0f}", marker, place, frame / columns.rate_hz))
     if not fixes:
         refuse(source, "no marker was seen in any frame")
     return fixes

@@ -15,6 +15,7 @@ from drivers.stations.export_format import (
     ExportFormat,
     Guess,
     Role,
+    measured_mm,
     polar_position_mm,
     refuse,
 )
@@ -89,9 +90,11 @@ def read_table(text: str, columns: ColumnMap, source: str) -> list[ExportedFix]:
         if is_polar:
             rad = RAD_PER[columns.angle_unit]
             zeniths[number] = number_at("zenith") * rad
-            place = polar_position_mm(number_at("hz") * rad, zeniths[number], number_at("distance") * mm)
+            place = polar_position_mm(
+                number_at("hz") * rad, zeniths[number], number_at("distance") * mm, source, number
+            )
         else:
-            place = (number_at("x") * mm, number_at("y") * mm, number_at("z") * mm)
+            place = measured_mm((number_at("x") * mm, number_at("y") * mm, number_at("z") * mm), source, number)
 
         def unit_at(role: Role, otherwise_mm: float) -> float:
             return mm_of("".join(header[places[role] :][:1]), otherwise_mm)

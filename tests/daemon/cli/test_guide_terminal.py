@@ -47,8 +47,8 @@ def test_a_file_that_is_no_plan_is_refused_with_its_place(tmp_path: Path, text: 
     assert refused.value.status == WRONG_USE
 
 
-def at_a_pose(*warnings: str) -> dict[str, Any]:
-    """State of a guide that waits for a pose."""
+def at_a_pose(*warnings: str, boom: BoomPosition | None = None) -> dict[str, Any]:
+    """State of a guide that waits for a pose; by default its joints were last read 30 s ago, elsewhere."""
     job = Job.of(Request(("cp1",), ("r",), 1, 0, plan=((MIDDLE, ("r",)),)))
     for kind, details in (
         ("opened", {"session": "s001-r", "last": 0}),
@@ -57,7 +57,9 @@ def at_a_pose(*warnings: str) -> dict[str, Any]:
     ):
         job = job.after(kind, details)
     row = GuideRow(1, "open", "S1", "Ada", {}, 3, Stamp(0, 0, "boot"))
-    boom = BoomPosition(MIDDLE | {"theta1": 0.0}, 30.0, None, is_fresh=False, missing="the joints were read 30 s ago")
+    if boom is None:
+        values = MIDDLE | {"theta1": 0.0}
+        boom = BoomPosition(values, 30.0, None, is_fresh=False, missing="the joints were read 30 s ago")
     around = Around(boom, None, None, None, 3, False, False, False, 1.0, 5, [*warnings], None)
     return state_of(RIG, row, job, around)
 
@@ -74,6 +76,17 @@ def test_the_screen_fits_a_narrow_terminal_and_says_what_is_old() -> None:
     whole = " ".join(line.strip() for line in lines)
     assert "Move every joint to its target; the pose is measured automatically once the boom stands." in whole
     assert "Enter: Measure here" in whole
+
+
+def test_what_a_boom_does_whose_joints_are_not_read_is_not_known() -> None:
+    for is_fresh, stands_s, kind, said in (
+        (False, None, "go_to_pose", "The joints are not read now; "),
+        (True, None, "hold", "The boom moves; "),
+        (True, 4.0, "hold", "The boom stands for 4 s; "),
+    ):
+        guide = at_a_pose(boom=BoomPosition(MIDDLE, 0.1 if is_fresh else 30.0, stands_s, is_fresh))
+        assert guide["step"]["kind"] == kind
+        assert any(line.startswith(said) for line in screen(guide, 80))
 
 
 def test_off_a_terminal_targets_are_printed_and_a_warning_once_until_it_changes(

@@ -571,6 +571,28 @@ def test_what_never_closes_is_read_in_linear_time(endless: str) -> None:
     assert refused(f"Trajectories{endless}x")
 
 
+@pytest.mark.parametrize(
+    ("text", "line", "said"),
+    [
+        (SDR_HEAD + sdr("09F1", "A", "1", 0.0, 90.0, 10.0), 3, "the distance 0 m is not between 0 and 6000 m"),
+        (SDR_HEAD + sdr("09F1", "A", "1", -5.0, 90.0, 10.0), 3, "the distance -5 m is not between 0 and 6000 m"),
+        (SDR_HEAD + sdr("09F1", "A", "1", 99999.0, 90.0, 10.0), 3, "the distance 99999 m is not between 0 and 6000 m"),
+        (SDR_HEAD + sdr("08TP", "1", 0.0, 0.0, 0.0), 3, "all coordinates are zero"),
+        ("point,hz_deg,zenith_deg,distance_m\n1,10,90,5\n2,20,91,0\n", 3, "the distance 0 m is not"),
+        ("point,x_m,y_m,z_m\n1,1,2,3\n2,0,0,0\n", 3, "all coordinates are zero"),
+        (
+            gts_download([("1", 43_575, 97.0, 131.0, ""), ("2", 7_000_000, 97.0, 131.0, "")]),
+            None,
+            "exceeds max_range_m",
+        ),
+    ],
+)
+def test_a_point_that_nothing_was_measured_of_is_refused_with_its_line(text: str, line: int | None, said: str) -> None:
+    message = refused(text)
+    assert said in message
+    assert line is None or f"line {line}" in message
+
+
 def test_an_empty_file_is_of_no_format() -> None:
     assert "unknown format" in refused("\n")
 

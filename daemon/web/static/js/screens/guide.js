@@ -127,7 +127,8 @@ function otherButtons(app, guide) {
 function holding(hold) {
   if (!hold) return null;
   const share = hold.needed_fixes ? hold.fixes / hold.needed_fixes : 0;
-  const text = hold.since_s === null ? "The boom is moving." : `Standing for ${duration(hold.since_s)}; ${hold.fixes} of ${plural(hold.needed_fixes, "fix", "fixes")}.`;
+  const moves = hold.is_known ? "The boom is moving." : "The joints are not read now.";
+  const text = hold.since_s === null ? moves : `Standing for ${duration(hold.since_s)}; ${hold.fixes} of ${plural(hold.needed_fixes, "fix", "fixes")}.`;
   return [h("p", null, text), bar(text, 0, share)];
 }
 
