@@ -49,8 +49,8 @@ class Rule:
         remedy: what to do; SUBJECT in it stands for the alarm's subject.
         after_s: how long a fault must last before an alarm is raised.
         hold_s: how long the fault must be absent before the alarm is cleared.
-        needs_storing: the evidence is that of decoded readings. While none are stored and decoded, the rule is paused:
-            its alarms stay as they are.
+        needs_decoding: the evidence is that of fresh readings. While captures wait to be stored or decoded, the rule is
+            paused: its alarms stay as they are.
         meaning: when the alarm is raised and cleared, for docs/reference/alarms.md.
         find: function that yields the faults in the evidence.
     """
@@ -60,13 +60,13 @@ class Rule:
     remedy: str
     after_s: float
     hold_s: float
-    needs_storing: bool
+    needs_decoding: bool
     meaning: str
     find: Callable[[Evidence], Iterable[Finding]]
 
     def is_paused(self, evidence: Evidence) -> bool:
         """Return True if the evidence is not up to date: it shows neither a fault nor that one is over."""
-        return self.needs_storing and not evidence.is_storing
+        return self.needs_decoding and not evidence.is_decoding
 
     def __call__(self, evidence: Evidence) -> Iterator[Alarm]:
         """Yield an alarm for every fault in the evidence; none while the rule is paused."""
@@ -87,7 +87,7 @@ def _cut(text: str) -> str:
 
 
 def rule(
-    severity: Severity, remedy: str, *, after_s: float = 0.0, hold_s: float = 0.0, needs_storing: bool = False
+    severity: Severity, remedy: str, *, after_s: float = 0.0, hold_s: float = 0.0, needs_decoding: bool = False
 ) -> Callable[[Callable[[Evidence], Iterable[Finding]]], Rule]:
     """Turn a function into a rule: its name is the kind of alarm, its docstring states when the alarm is raised.
 
@@ -96,11 +96,11 @@ def rule(
         remedy: what to do; SUBJECT in it stands for the alarm's subject.
         after_s: how long a fault must last before an alarm is raised.
         hold_s: how long the fault must be absent before the alarm is cleared.
-        needs_storing: whether its alarms stay as they are while no readings are stored and decoded.
+        needs_decoding: whether its alarms stay as they are while captures wait to be stored or decoded.
     """
 
     def made(find: Callable[[Evidence], Iterable[Finding]]) -> Rule:
         meaning = " ".join((find.__doc__ or "").split())
-        return Rule(find.__name__, severity, remedy, after_s, hold_s, needs_storing, meaning, find)
+        return Rule(find.__name__, severity, remedy, after_s, hold_s, needs_decoding, meaning, find)
 
     return made

@@ -182,7 +182,9 @@ class AlarmBoard(WokenThread):
 
     def _clear(self, found: Mapping[tuple[str, str], object], now: Stamp) -> None:
         for key, active in list(self._active.items()):
-            if key in found or active.alarm.kind in self._failed_rules or active.alarm.kind in self._paused_rules:
+            if active.alarm.kind in self._failed_rules or active.alarm.kind in self._paused_rules:
+                active.seen = now
+            if key in found:
                 continue
             if now.since(active.seen) >= active.hold_s * NS_PER_S:
                 del self._active[key]

@@ -17,6 +17,8 @@ from daemon.store.upkeep.housekeeping import KeepingState
 from drivers.clock import NS_PER_S, Clock, Stamp
 from drivers.readings import EventKind
 
+LATE_S = 2.0  # readings that wait longer than this to be stored and decoded are not fresh
+
 
 @dataclass(frozen=True)
 class Evidence:
@@ -81,9 +83,11 @@ class Evidence:
         return 0.0 if self.session is None else self.now.since(self.session.started) / NS_PER_S
 
     @property
-    def is_storing(self) -> bool:
-        """True if captures are stored and so decoded; until they are, every device appears silent."""
-        return self.acquisition.error is None and not self.acquisition.is_write_hung
+    def is_decoding(self) -> bool:
+        """True if captures are stored and decoded as they come; if they wait, no reading is fresh."""
+        acquisition = self.acquisition
+        is_late = acquisition.undecoded_s is None or acquisition.undecoded_s > LATE_S
+        return acquisition.error is None and not acquisition.is_write_hung and not is_late
 
     def active_events(self, kind: EventKind, *ended_by: EventKind) -> list[EventStatus]:
         """Return the last events of a kind that are still active: not of code 0, and not ended by a later event.

@@ -150,7 +150,12 @@ class MeterLink:
                 if not answer.endswith(b"\n"):
                     take({"error": "the gain meter's process has ended; it is being restarted"})
                     return
-                take(json.loads(answer))
+                try:
+                    take(json.loads(answer))
+                except Exception:
+                    # Such as a full disk: the process ends with its pipes, is restarted and asked again
+                    log.exception("an answer of the gain meter could not be used")
+                    return
 
     def _next(self) -> tuple[Mapping[str, Any], Callable[[Answer], None]] | None:
         """Wait for a question; return None once the link closes."""

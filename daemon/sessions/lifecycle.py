@@ -26,7 +26,14 @@ from daemon.store.connection import rig_sha256
 from daemon.store.queries.jobs import JobTable
 from daemon.store.queries.observations import first_constants_mm
 from daemon.store.queries.poses import has_poses_before_enclosed, is_enclosed
-from daemon.store.queries.sessions import OTHER_RIG_FILE, ZERO_LOST, SessionTable, session
+from daemon.store.queries.sessions import (
+    OPEN_AT_NEXT,
+    OPEN_IN_BACKUP,
+    OTHER_RIG_FILE,
+    ZERO_LOST,
+    SessionTable,
+    session,
+)
 from daemon.store.queries.setups import SetupTable
 from daemon.store.queries.zeros import lost_zeros, preset_jumps
 from daemon.store.store import Store
@@ -113,13 +120,13 @@ class SessionLifecycle:
         else:
             changed = f"session {next_one} was started" if next_one else "the rig file was changed"
         why = f"closed by rigcal: {changed} while it was open"
-        excluded = f"it was still open when session {next_one} was started" if next_one else None
+        left_open = f"{OPEN_AT_NEXT}{next_one} was started" if next_one else None
         with self._store.transaction():
             self.table.change(
                 row["id"],
                 state="closed",
                 note="; ".join(filter(None, (row["note"], why))),
-                excluded=excluded or self._why_not_used(row["id"]),
+                excluded=left_open or self._why_not_used(row["id"]),
                 **self._store.instant(self.table.last_measured(row["id"]), "ended_"),
             )
         log.warning("session %s (prism %s): %s; start a new session", row["id"], row["prism"], why)
@@ -250,7 +257,12 @@ class SessionLifecycle:
     def _why_not_used(self, session_id: str) -> str | None:
         """Return why calibration must not use a session, a clause; None if it may."""
         row = self._row(session_id)
-        reasons = self._why_other_readings(row), self._why_other_constant(row), self._why_moved(session_id)
+        reasons = (
+            self._why_other_readings(row),
+            _why_left_open(row),
+            self._why_other_constant(row),
+            self._why_moved(session_id),
+        )
         return "; ".join(filter(None, reasons)) or None
 
     def _why_other_constant(self, row: Mapping[str, Any]) -> str | None:
@@ -286,6 +298,12 @@ class SessionLifecycle:
         if has_poses_before_enclosed(self._store, session_id):
             return NOT_THE_SAME
         return None if is_enclosed(self._store, session_id, LEAST_ENCLOSED) else NOT_ENCLOSED
+
+
+def _why_left_open(row: Mapping[str, Any]) -> str | None:
+    """Return the part of the reason why a session is not used that only an operator can end; None without one."""
+    reasons = (row["excluded"] or "").split("; ")
+    return next((reason for reason in reasons if reason.startswith((OPEN_AT_NEXT, OPEN_IN_BACKUP))), None)
 
 
 def _has_other_readings(closed: Mapping[str, Any]) -> bool:

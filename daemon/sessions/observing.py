@@ -160,7 +160,8 @@ class ObservationMaker:
             return OF_CONTROL_POINT
         suspected = self._prisms.follow(session, joined, place_mm)
         if session.kind in STANDING_KINDS and joined.standstill is None:
-            return suspected or "moving"  # stored, because a restart before the boom stands must not end the suspicion
+            # A suspicion is stored: a restart before the boom stands must not end it, and it is no fix of the prism
+            return suspected or self._prisms.doubt(session, joined.fix) or "moving"
         return None
 
     def _why_another_prism(self, session: OpenSession, joined: JoinedFix, place_mm: Place) -> str | None:

@@ -40,7 +40,12 @@ def bus_error_passive(evidence: Evidence) -> Iterator[Finding]:
             yield event.device, event.text
 
 
-@rule("warning", "Check the node: it may be about to fail, or it was configured without a heartbeat.", after_s=3.0)
+@rule(
+    "warning",
+    "Check the node: it may be about to fail, or it was configured without a heartbeat.",
+    after_s=3.0,
+    needs_decoding=True,
+)
 def heartbeat_lost(evidence: Evidence) -> Iterator[Finding]:
     """A CANopen node has stopped its heartbeat but still sends values: it is no longer supervised.
 

@@ -27,7 +27,6 @@ _WHY = {
     "Check that the machine is on, and check the cable between bus and adapter.",
     after_s=1,
     hold_s=3,
-    needs_storing=True,
 )
 def link_silent(evidence: Evidence) -> Iterator[Finding]:
     """A CAN link has been open for 5 s, but no frame has arrived on it since its silent channels were last received.
@@ -45,7 +44,6 @@ def link_silent(evidence: Evidence) -> Iterator[Finding]:
     "Check the encoder's power and cable; without this joint no fix can be used.",
     after_s=1.0,
     hold_s=3.0,
-    needs_storing=True,
 )
 def joint_silent(evidence: Evidence) -> Iterator[Finding]:
     """No reading of a joint has arrived for 1 s longer than its timeout, and its link has been open for 5 s.
@@ -60,7 +58,6 @@ def joint_silent(evidence: Evidence) -> Iterator[Finding]:
     "Check the signal's device and cable; effects that need this signal cannot be identified.",
     after_s=1.0,
     hold_s=3.0,
-    needs_storing=True,
 )
 def signal_silent(evidence: Evidence) -> Iterator[Finding]:
     """No reading of a machine signal has arrived for 1 s longer than its timeout.
@@ -71,7 +68,7 @@ def signal_silent(evidence: Evidence) -> Iterator[Finding]:
 
 
 @rule(
-    "critical", "Check the device; without this joint no fix can be used.", after_s=1.5, hold_s=3.0, needs_storing=True
+    "critical", "Check the device; without this joint no fix can be used.", after_s=1.5, hold_s=3.0, needs_decoding=True
 )
 def joint_not_usable(evidence: Evidence) -> Iterator[Finding]:
     """The readings of a joint carry no usable value.
@@ -88,7 +85,7 @@ def joint_not_usable(evidence: Evidence) -> Iterator[Finding]:
     "Check the device; effects that need this signal cannot be identified.",
     after_s=1.5,
     hold_s=3.0,
-    needs_storing=True,
+    needs_decoding=True,
 )
 def signal_not_usable(evidence: Evidence) -> Iterator[Finding]:
     """The readings of a machine signal carry no usable value.

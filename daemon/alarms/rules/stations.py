@@ -17,7 +17,6 @@ _TURNED_AWAY = (LockState.STANDBY, LockState.SEARCHING, LockState.WAITING, LockS
     "critical",
     "Check that the station is on; check its cable and its settings (baud rate, parity, line end).",
     hold_s=3.0,
-    needs_storing=True,
 )
 def station_silent(evidence: Evidence) -> Iterator[Finding]:
     """A station has sent no records for longer than its timeout, and none of its captures wait to be decoded.
@@ -35,7 +34,7 @@ def station_silent(evidence: Evidence) -> Iterator[Finding]:
     "Aim the station at the session's prism, and check whether something blocks the line of sight.",
     after_s=2.5,
     hold_s=3,
-    needs_storing=True,
+    needs_decoding=True,
 )
 def station_not_locked(evidence: Evidence) -> Iterator[Finding]:
     """A station has followed no prism for 2.5 s while a session is open.
@@ -53,7 +52,7 @@ def station_not_locked(evidence: Evidence) -> Iterator[Finding]:
     "Level the instrument, or switch its compensator on; then describe a new set-up.",
     after_s=3,
     hold_s=3,
-    needs_storing=True,
+    needs_decoding=True,
 )
 def station_tilted(evidence: Evidence) -> Iterator[Finding]:
     """A station has reported for 3 s that its compensator is out of range or off; its fixes are not used."""

@@ -44,6 +44,9 @@ _OTHER_INSTANTS = """SELECT boot_id, monotonic_ns, utc_ns, 0 AS is_before FROM c
 # was lost. Stored reasons are compared with these prefixes, so they must not change.
 OTHER_RIG_FILE = "it was recorded with another rig file: "
 ZERO_LOST = "an encoder has jumped since, and nobody has checked its zero: "
+# Beginnings of reasons that only an operator can end, as nothing else in the store shows them
+OPEN_IN_BACKUP = "the session was open in the backup"
+OPEN_AT_NEXT = "it was still open when session "
 # Within a boot both clocks run at the same rate, whatever NTP does, so their difference changes only when the clock is
 # set. A later boot must not show an earlier time. For the time since the end of the previous session only backward
 # steps count, because a computer that was suspended is ahead. The first query is cheap, and nearly always sufficient

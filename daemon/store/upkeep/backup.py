@@ -23,6 +23,7 @@ from pathlib import Path
 from daemon.host.safe_output import write_file
 from daemon.store.errors import StoreError, storage_errors
 from daemon.store.files import BESIDE, RestoreNote, WriterLock, restore_note_path
+from daemon.store.queries.sessions import OPEN_IN_BACKUP
 from daemon.store.upkeep.soundness import Soundness, check_store
 from daemon.version import VERSION
 
@@ -32,12 +33,12 @@ RESERVE_BYTES = 256 * 2**20  # free space to leave where a backup is written
 STEP_PAGES = 4096
 # After the backup was made there may have been more fixes, and other sessions, so present fixes may not belong to the
 # session that was open in the backup.
-_CLOSE_OPEN_SESSIONS = """UPDATE calibration_sessions AS s SET state = 'closed',
+CLOSE_OPEN_SESSIONS = f"""UPDATE calibration_sessions AS s SET state = 'closed',
         (ended_utc_ns, ended_monotonic_ns, ended_boot_id) = (SELECT * FROM (
             SELECT alive_utc_ns, alive_monotonic_ns, alive_boot_id FROM daemon_runs
             UNION ALL SELECT s.started_utc_ns, s.started_monotonic_ns, s.started_boot_id)
             ORDER BY alive_boot_id DESC, alive_monotonic_ns DESC LIMIT 1),
-        excluded = 'the session was open in the backup from which the store was restored'
+        excluded = '{OPEN_IN_BACKUP} from which the store was restored'
     WHERE state = 'open'"""
 _FIRST_BOOT = "SELECT kernel_boot_id, booted_utc_ns FROM boots ORDER BY id LIMIT 1"
 _NAME = re.compile(r"rigcal-\d{8}T\d{6}Z")
@@ -251,7 +252,7 @@ def _make_writable(directory: Path) -> None:
 
 def _close_open_sessions(store: Path) -> None:
     with contextlib.closing(sqlite3.connect(store)) as db, db:
-        db.execute(_CLOSE_OPEN_SESSIONS)
+        db.execute(CLOSE_OPEN_SESSIONS)
 
 
 def _exchange(backup: Path, scratch: Path, store: Path, models: Path, name: str) -> Path | None:

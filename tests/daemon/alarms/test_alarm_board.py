@@ -267,7 +267,7 @@ def test_alarms_of_silent_devices_neither_end_nor_begin_while_the_disk_does_not_
         assert looked(5) == ["theta1"]
         seen = now
         silent = [replace(one, status="silent") for one in seen.channels]  # none is decoded: every device seems silent
-        for hindrance in ({"is_write_hung": True}, {"error": "the disk is full"}):
+        for hindrance in ({"is_write_hung": True}, {"error": "the disk is full"}, {"undecoded_s": 9.0}):
             now = replace(seen, channels=silent, **hindrance)
             assert looked(10) == ["theta1"], hindrance
         assert ("cleared", "joint_silent") not in told

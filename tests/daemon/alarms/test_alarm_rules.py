@@ -428,12 +428,19 @@ def test_nothing_known_raises_nothing() -> None:
 
 
 def test_a_full_disk_does_not_send_anyone_to_the_cables_of_devices_that_are_not_decoded_meanwhile() -> None:
-    quiet: dict[str, Any] = {"channels": [SILENT, QUIET], "frames_s": [40.0]}
-    quiet["stations"] = [station("silent", "unknown")]
-    alone = known(channels=[SILENT, channel(name="theta3"), QUIET], error="disk full")
-    assert {a.kind for rule in library() for a in rule(known(**quiet))} == {"link_silent", "station_silent"}
-    assert [a.kind for rule in library() for a in rule(known(**quiet, error="disk full"))] == ["not_storing"]
-    assert [a.kind for rule in library() for a in rule(alone)] == ["not_storing"]
+    def kinds(is_silent: bool) -> list[str]:
+        waiting = known(
+            channels=[replace(one, is_silent=is_silent) for one in (SILENT, QUIET)],
+            frames_s=[40.0],
+            stations=[station("silent", "unknown", is_silent=is_silent)],
+            error="disk full",
+        )
+        return [a.kind for rule in library() for a in rule(waiting)]
+
+    assert kinds(is_silent=False) == ["not_storing"]
+    assert sorted(kinds(is_silent=True)) == ["link_silent", "not_storing", "station_silent"], (
+        "silent before it was full"
+    )
 
 
 def test_a_silent_station_is_one_alarm_although_it_did_not_answer_a_command() -> None:

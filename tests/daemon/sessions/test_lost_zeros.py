@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import pytest
+
 from daemon.store.queries.sessions import ZERO_LOST, SessionTable
 from daemon.store.queries.zeros import lost_zeros
+from daemon.store.upkeep.backup import CLOSE_OPEN_SESSIONS
 from drivers.readings import DeviceEvent, EventKind
+from tests.daemon.sessions.test_rig_file_changes import change_rig_file
 from tests.daemon.support.sessions import SOURCE, Rig, controlled
 
 LOST = f"{ZERO_LOST}theta1"
@@ -132,3 +136,33 @@ def test_a_session_says_all_that_speaks_against_it(session_rig: Rig) -> None:
     jump(session_rig)
     told = session_rig.say("list")[0]["not_used"]
     assert told.startswith(f"{LOST}; no control point was shot")
+
+
+@pytest.mark.parametrize("is_of_backup", [False, True])
+def test_a_session_that_was_left_open_is_not_used_after_zeros_were_lost_and_checked(
+    session_rig: Rig, is_of_backup: bool
+) -> None:
+    store, clock = session_rig.store, session_rig.clock
+    name = str(session_rig.say("start", prism="r")["id"])
+    for _ in range(2):
+        session_rig.shoot("cp1", (9000.0, 500.0, 2000.0))
+        session_rig.live(2)
+    if is_of_backup:
+        with store.transaction() as db:
+            db.execute(CLOSE_OPEN_SESSIONS)
+    else:
+        store.note_alive(clock.now())
+        clock.advance(86_400)
+        store.begin_run(clock.now())
+        row = {"id": "later", "rig": "boom7", "prism": "b", "operator": "", "kind": "static_poses", "state": "closed"}
+        at = store.instant(clock.now(), "started_") | store.instant(clock.now(), "ended_")
+        store.insert("calibration_sessions", row | at)
+    change_rig_file(session_rig, SOURCE.rig)
+    why = session_rig.say("show", id=name)["not_used"]
+    assert "was open in the backup" in why or "still open when session later was started" in why
+    after = controlled(session_rig)
+    jump(session_rig)
+    assert session_rig.say("show", id=name)["not_used"].startswith(f"{LOST}; {why}")
+    check_zeros(session_rig, after)
+    assert why in session_rig.say("show", id=name)["not_used"]
+    assert used(session_rig) == [after]
