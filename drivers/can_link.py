@@ -319,14 +319,14 @@ class _Session:
             published: own frames to send.
         """
         monotonic_ns = self._clock.monotonic_ns()
+        for request in requests:  # before anything is sent: a send that fails must not lose them
+            self._setup.add(request)
         if self._sync is not None:
             sync = self._sync.due(monotonic_ns)
             if sync is not None:
                 self._send(sync)
         for frame in published:
             self._send(frame)
-        for request in requests:
-            self._setup.add(request)
         if self._setup.is_active:
             self._setup.advance(self._clock.now())
         # Even if no set-up is active any more, the last node's start command and event may be left to send

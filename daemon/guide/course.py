@@ -89,11 +89,12 @@ class Course:
             log.warning("guide %d is abandoned: %s", guide[0].id, _WITHOUT_SESSION)
             self.abandon(_WITHOUT_SESSION)
         # Fixes that were captured but not decoded yet must not count if the station was on no prism.
-        for since, until in self.record.times_away():
-            self._sessions.look_away(since, until)
+        away = [*self.record.times_away()]
         guide = self.record.opened()
         if guide is not None and not guide[1].run.session:  # the last run may have just opened one
-            self._sessions.look_away(guide[0].started)
+            away.append((guide[0].started, None))
+        if away:
+            self._sessions.was_away(away)
         if self.record.is_open:
             self.start_advisor()
 

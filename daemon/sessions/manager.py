@@ -11,7 +11,7 @@ import logging
 import math
 import sqlite3
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -296,16 +296,22 @@ class SessionManager:
 
     # ---- for a guide -------------------------------------------------------------------------------------------------
 
-    def look_away(self, since: Stamp | None = None, until: Stamp | None = None) -> None:
-        """Exclude fixes of the open session from an instant on, because the station is not on its prism.
+    def look_away(self) -> None:
+        """Exclude fixes of the open session from now on, because the station is not on its prism."""
+        session = self._open
+        if session is not None:
+            session.shots.append(Shot(0, self._clock.now()))
+
+    def was_away(self, times: Iterable[tuple[Stamp, Stamp | None]]) -> None:
+        """Exclude fixes of the open session, and judge its prism again, after an earlier run of the daemon.
 
         Args:
-            since: when the station was turned away; now by default.
-            until: when it was back on the prism, if it is already.
+            times: when the station was turned away from the prism, and when it was back; None where it is not yet.
         """
         session = self._open
         if session is not None:
-            session.shots.append(Shot(0, since or self._clock.now(), until))
+            session.shots += [Shot(0, since, until) for since, until in times]
+            self._prisms.restore(session)
 
     def look_back(self, operator: str) -> None:
         """Use the fixes of the open session again, after an operator has confirmed that the station is on its prism."""

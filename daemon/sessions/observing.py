@@ -26,7 +26,7 @@ from daemon.sessions.prisms.standstill_places import (
 )
 from daemon.sessions.station_setups import AXES, Place
 from daemon.store.errors import is_unwritable
-from daemon.store.queries.observations import OF_CONTROL_POINT, ObservationTable, last_standstills
+from daemon.store.queries.observations import OF_CONTROL_POINT, ObservationTable, last_standstills, newest_observation
 from daemon.store.store import Store
 from drivers.clock import Stamp, lies_within
 from drivers.readings import DeviceEvent, Fix
@@ -34,6 +34,7 @@ from drivers.readings import DeviceEvent, Fix
 log = logging.getLogger(__name__)
 
 STANDING_KINDS = ("static_poses", CHECK)
+MOVING = "moving"
 _LEFT_OUT = "an observation of a session can never be stored, and was discarded"
 
 
@@ -122,8 +123,11 @@ class ObservationMaker:
         self.newest: tuple[str, Stamp, str | None] | None = None
 
     def restore(self, session: OpenSession) -> None:
-        """Restore the places of the standstill during which an earlier run of the daemon ended."""
+        """Restore the newest observation, and the places of the standstill in which an earlier run ended."""
         with self._store.reader() as reader:
+            newest = newest_observation(reader, session.id)
+            if newest is not None:
+                self.newest = session.id, reader.stamp(newest), newest["excluded"]
             for row in last_standstills(reader, session.id, ELSEWHERE, SETTLED_FIXES):
                 standstill, stamp = Standstill.of_pose(session.id, row["pose"]), reader.stamp(row)
                 place_mm, values = (row["x_mm"], row["y_mm"], row["z_mm"]), json.loads(row["values_json"])
@@ -160,8 +164,9 @@ class ObservationMaker:
             return OF_CONTROL_POINT
         suspected = self._prisms.follow(session, joined, place_mm)
         if session.kind in STANDING_KINDS and joined.standstill is None:
+            self._prisms.note_moving(session, joined)
             # A suspicion is stored: a restart before the boom stands must not end it, and it is no fix of the prism
-            return suspected or self._prisms.doubt(session, joined.fix) or "moving"
+            return suspected or self._prisms.doubt(session, joined.fix) or MOVING
         return None
 
     def _why_another_prism(self, session: OpenSession, joined: JoinedFix, place_mm: Place) -> str | None:
@@ -184,7 +189,8 @@ class ObservationMaker:
 
     def _exclude(self, session: OpenSession, changed: Exclusions, stamp: Stamp) -> None:
         if changed:
-            self._pending.add(lambda: self._table.exclude(session.id, changed, stamp))
+            if_moving = MOVING if session.kind in STANDING_KINDS else None
+            self._pending.add(lambda: self._table.exclude(session.id, changed, stamp, if_moving=if_moving))
 
     def _add(self, session: OpenSession, joined: JoinedFix, place_mm: Place, excluded: str | None) -> None:
         """Store an observation; a shot may have located a control point at its place since it was judged."""

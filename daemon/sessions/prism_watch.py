@@ -96,6 +96,14 @@ class PrismWatch:
         stretch.instants_ns.append(joined.stamp.monotonic_ns)
         return changed
 
+    def note_moving(self, session: OpenSession, joined: JoinedFix) -> None:
+        """Note a fix given to `see` of a moving boom: later verdicts on its target apply to it as well."""
+        guard, evidence = session.guards.get(joined.fix.station), session.evidence
+        turn = None if guard is None else guard.turn(joined.fix.stamp)
+        if evidence is not None and turn is not None:
+            stretch = evidence.stretch(joined.fix.station, turn.at, turn.is_believed)
+            stretch.instants_ns.append(joined.stamp.monotonic_ns)
+
     def follow(self, session: OpenSession, joined: JoinedFix, place_mm: Place) -> str | None:
         """Compare a fix given to `see`, used or not, with the motion of the joints since the previous fix.
 
@@ -216,8 +224,11 @@ class PrismWatch:
     def restore(self, session: OpenSession) -> None:
         """Restore the state of an earlier run of the daemon from the store; the next fix is treated as a new lock.
 
-        A restart ends no suspicion, and a change of target while the daemon was down may begin one.
+        A restart ends no suspicion, and a change of target while the daemon was down may begin one. What was restored
+        before is discarded, as after more has become known of the session.
         """
+        session.guards.clear()
+        session.confirmations.clear()
         self.prepare()
         self.begin(session)
         with self._store.reader() as reader:

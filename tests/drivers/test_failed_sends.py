@@ -165,6 +165,26 @@ def test_a_set_up_that_cannot_be_sent_is_cancelled_and_not_sent_later(adapter: A
     assert heard.events(EventKind.LINK_LOST) == []
 
 
+def test_a_set_up_requested_while_the_bus_goes_down_is_reported(bus: FailingBus) -> None:
+    setups = BOTH["setups"]
+    config = CanLinkConfig(
+        name="boom",
+        interface="socketcan",
+        channel="can0",
+        allow_transmit=True,
+        sync_period_ms=10.0,
+        transmit_nodes=BOTH["transmit_nodes"],
+    )
+    link = CanLink(config, SystemClock(), setups)
+    with running(link) as heard:
+        heard.wait_for(EventKind.LINK_UP)
+        with link._requests_lock:  # so that the next SYNC, which fails, comes before the request is taken
+            link._requests = [*(link._requests or ()), *setups]
+            bus.failure = NETWORK_DOWN
+        heard.wait_for(EventKind.LINK_LOST)
+        heard.wait_for(EventKind.ALARM, len(setups))
+
+
 def test_bytes_that_wait_when_a_poll_cannot_be_written_are_read_before_the_link_is_lost(tmp_path: Path) -> None:
     collected, stop = Collected(), threading.Event()
     with plugged_in(tmp_path / "tty") as instrument:

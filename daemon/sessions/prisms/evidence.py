@@ -78,7 +78,7 @@ class Stretch:
         since: instant of the first fix.
         is_believed: an operator has confirmed that they are of the session's prism; the joints are not consulted.
         sightings: sightings that are used for comparison.
-        instants_ns: monotonic instants of its observations that calibration may use as far as the target is concerned.
+        instants_ns: monotonic instants of its observations whose exclusion depends on the target.
         verdict: verdict so far.
         is_sure: whether there were enough targets to compare with.
     """

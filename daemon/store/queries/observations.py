@@ -17,7 +17,8 @@ from drivers.clock import Stamp
 OF_CONTROL_POINT = "a control point, not the prism"  # why an observation must not be used
 
 # A control point is not a prism of the rig, so this reason is never replaced by later findings about prisms.
-_EXCLUDE = f"""UPDATE observations SET excluded = ? WHERE session_id = ? AND boot_id = ? AND monotonic_ns = ?
+_EXCLUDE = f"""UPDATE observations SET excluded = coalesce(?, CASE WHEN moving THEN ? END)
+    WHERE session_id = ? AND boot_id = ? AND monotonic_ns = ?
     AND excluded IS NOT '{OF_CONTROL_POINT}'"""
 _EXCLUDE_NEAR = f"""UPDATE observations SET excluded = '{OF_CONTROL_POINT}' WHERE session_id = ?1 AND excluded IS NULL
     AND (x_mm - ?2) * (x_mm - ?2) + (y_mm - ?3) * (y_mm - ?3) + (z_mm - ?4) * (z_mm - ?4) < ?5 * ?5"""
@@ -43,6 +44,9 @@ _LAST_STANDSTILLS = """SELECT pose, utc_ns, monotonic_ns, boot_id, x_mm, y_mm, z
         SELECT pose FROM (SELECT pose, max(id) FROM observations WHERE session_id = ?1 AND pose IS NOT NULL
             GROUP BY substr(pose, 1, instr(pose, '.'))))
     ORDER BY id LIMIT ?3"""
+# A session's newest observation, which lies at the end of the table while the session is open.
+_NEWEST = """SELECT utc_ns, monotonic_ns, boot_id, excluded FROM observations NOT INDEXED WHERE session_id = ?
+    ORDER BY id DESC LIMIT 1"""
 
 # Each station's oldest fix that is of the prism, as far as is known, and contains a prism constant. A station that
 # transmits constants does so from its first fix on, so the rest of a long session is not read.
@@ -154,17 +158,20 @@ class ObservationTable:
         """Add the observation of a fix."""
         self._store.insert("observations", {**columns, "fix_id": fix_id, **self._store.instant(measured)})
 
-    def exclude(self, session_id: str, exclusions: Mapping[int, str | None], newest: Stamp) -> None:
+    def exclude(
+        self, session_id: str, exclusions: Mapping[int, str | None], newest: Stamp, *, if_moving: str | None = None
+    ) -> None:
         """Change why observations of a session must not be used.
 
         Args:
             session_id: the session.
             exclusions: instant of a fix, monotonic ns -> why calibration must not use it; None if it may.
             newest: instant of the newest fix; all fixes are of its boot.
+            if_moving: why it must not use a fix of a moving boom that has no other fault; None if it may.
         """
         with self._store.transaction() as db:
             boot = self._store.boot_row(newest)
-            rows = [(excluded, session_id, boot, at_ns) for at_ns, excluded in exclusions.items()]
+            rows = [(excluded, if_moving, session_id, boot, at_ns) for at_ns, excluded in exclusions.items()]
             db.conn.executemany(_EXCLUDE, rows)
             self._store.once_committed(self._has_excluded)
 
@@ -226,6 +233,11 @@ def fixes_since_used(source: RowSource, session_id: str, station: str) -> Iterat
         Rows of `fixes` with `excluded` of their observations; None where a fix is used or has no observation.
     """
     return iter(source.rows(_FIXES, (session_id, station)))
+
+
+def newest_observation(source: RowSource, session_id: str) -> dict[str, Any] | None:
+    """Return instant and `excluded` of the newest observation of a session that is open; None if it has none."""
+    return next(iter(source.rows(_NEWEST, (session_id,))), None)
 
 
 def last_standstills(source: RowSource, session_id: str, excluded: str, most: int) -> Iterator[dict[str, Any]]:

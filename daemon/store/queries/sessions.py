@@ -53,6 +53,7 @@ OPEN_AT_NEXT = "it was still open when session "
 # together with the tally of observations.
 _CLOCK_RANGE = f"""SELECT min(boot_id), max(boot_id), min(utc_ns - monotonic_ns), max(utc_ns - monotonic_ns), count(*)
     FROM ({_OTHER_INSTANTS})"""
+_CLOCK_NOW = "SELECT utc_ns - monotonic_ns AS now_ns FROM observations WHERE id = ?"
 _CLOCK_STEPS = f"""WITH instants AS (
         SELECT boot_id, monotonic_ns, utc_ns, 0 AS is_before FROM observations WHERE session_id = ?1
         UNION ALL {_OTHER_INSTANTS}),
@@ -400,10 +401,9 @@ def fixes_measured(source: RowSource, session_id: str) -> Iterator[dict[str, Any
 
 
 def _summary(source: RowSource, session_id: str, count: Callable[[RowSource, str], Tally] = tally_of) -> dict[str, Any]:
-    found = list(source.rows(_SUMMARY, (session_id,)))
-    if not found:
+    row = next(iter(source.rows(_SUMMARY, (session_id,))), None)
+    if row is None:
         raise _unknown(session_id)
-    row = found[0]
     accepted = {key: row.pop(f"accepted_{key}") for key in ("despite", "by", "user", "utc_ns")}
     tally = count(source, session_id)
     steps = _clock_steps(source, tally)
@@ -437,11 +437,13 @@ def _clock_steps(source: RowSource, tally: Tally) -> list[dict[str, Any]]:
     first, last, least_ns, most_ns = seen = tally.clock_with(clock)
     if first == last and most_ns - least_ns < CLOCK_STEP_NS:
         return []
-    if (seen, instants) not in tally.steps:  # computed again only when the clocks show something new
-        steps = source.rows(_CLOCK_STEPS, (tally.session_id,))
-        found_now = [{"at_utc_ns": step["at_utc_ns"], "step_s": step["step_ns"] / NS_PER_S} for step in steps]
-        tally.steps[seen, instants] = found_now
-    return tally.steps[seen, instants]
+    now_ns = [row["now_ns"] for row in source.rows(_CLOCK_NOW, (tally.through,))]
+    shown = seen, instants, *(round(one / CLOCK_STEP_NS) for one in now_ns)
+    if shown not in tally.steps:  # computed again only when the clocks show something other than last time
+        steps = [*source.rows(_CLOCK_STEPS, (tally.session_id,))]
+        tally.steps.clear()
+        tally.steps[shown] = [{"at_utc_ns": s["at_utc_ns"], "step_s": s["step_ns"] / NS_PER_S} for s in steps]
+    return tally.steps[shown]
 
 
 def _unknown(session_id: str) -> NotInStoreError:

@@ -19,6 +19,8 @@ from daemon.sessions.export.captured_logs import export_session
 from daemon.sessions.export.session_file import SessionFile, read_session_file
 from daemon.sessions.manager import SessionManager
 from daemon.sessions.prisms.guard import MotionLimit
+from daemon.sessions.prisms.standstill_places import ELSEWHERE
+from daemon.store.queries.observations import moving_observations
 from daemon.store.reader import Reader
 from drivers.clock import ManualClock
 from drivers.logs.can_log import write_can_log
@@ -29,7 +31,7 @@ from simulators.faults import parse_faults
 from simulators.rig.truth import RigTruth
 from simulators.rig_simulator import RigSimulator, SimulatorSettings
 from tests.daemon.sessions.test_sessions import SOURCE, Rig, start
-from tests.daemon.support.sessions import closed_afterwards, disk_fails
+from tests.daemon.support.sessions import STEP_S, closed_afterwards, disk_fails
 from tests.daemon.support.store import table
 from tests.simulated.captures import Step, generate
 from tests.simulated.scripted_host import ScriptedHost
@@ -223,6 +225,52 @@ def test_a_suspicion_that_began_while_the_boom_moved_outlasts_a_restart_before_i
     assert len(rig.keeper.prism_suspicions()) == 1
     rig.live(5)
     assert {round(row["x_mm"]) for row in table(rig.store.path, "observations") if row["excluded"] is None} == {3000}
+
+
+@pytest.mark.parametrize("moving_s", [1.2, 3.0])
+def test_a_jump_that_only_a_usual_interval_shows_outlasts_a_restart_before_the_boom_stands(
+    rig: Rig, moving_s: float
+) -> None:
+    rig.steps_of_fix = 10  # 0.5 s: after a restart a second is assumed, in which a prism may move 5 m
+    start(rig)
+    rig.live(6)
+    rig.target_mm = NEARER_MM
+    rig.live(moving_s, theta1=1.0)
+    (before,) = rig.keeper.prism_suspicions()
+    rig.keeper = rig.new_keeper()
+    assert [one.reason for one in rig.keeper.prism_suspicions()] == [before.reason]
+    rig.live(6)
+    assert {round(row["x_mm"]) for row in table(rig.store.path, "observations") if row["excluded"] is None} == {3000}
+
+
+def test_moving_fixes_of_a_suspected_prism_give_no_latency(rig: Rig) -> None:
+    start(rig)
+    rig.live(5)
+    rig.target_mm = ANOTHER_MM
+    rig.live(1)
+    rig.live(5, theta1=1.0)
+    rig.target_mm = PRISM_MM
+    rig.live(2)
+    rig.live(5, theta1=1.0)
+    with rig.store.reader() as reader:
+        moving = moving_observations(reader, ["s001-r"])
+    assert {round(row["y_mm"]) for row in moving} == {8000}
+
+
+def test_a_restart_forgets_not_that_the_newest_fix_lies_elsewhere(rig: Rig) -> None:
+    start(rig)
+    rig.live(3)
+    x, y, z = rig.target_mm
+    rig.target_mm = (x + 200.0, y, z)
+    rig.live(STEP_S)
+    rig.steps_of_fix = 10**6  # a station that is aimed by hand: no fix for a while
+    rig.live(2)
+    why = rig.keeper.not_counting()
+    assert why is not None
+    assert why.startswith(ELSEWHERE)
+    rig.keeper = rig.new_keeper()
+    rig.live(20)
+    assert rig.keeper.not_counting() == why
 
 
 def test_another_prism_that_was_found_while_the_daemon_was_away_is_suspected(rig: Rig) -> None:

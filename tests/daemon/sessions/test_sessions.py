@@ -112,6 +112,20 @@ def test_a_session_whose_clock_was_set_is_flagged(rig: Rig, step_s: float, backw
     assert len(advice) == backwards
 
 
+def test_status_shows_steps_of_the_clock_that_go_back_to_where_it_was(rig: Rig) -> None:
+    start(rig)
+    shown = []
+    for step_s in (10, -10, 10):
+        rig.live(2)
+        now = rig.clock.now()
+        rig.clock.set(Stamp(now.utc_ns + step_s * NS_PER_S, now.monotonic_ns, now.boot_id))
+        rig.live(2)
+        opened = rig.keeper.open_session()
+        assert opened is not None
+        shown.append([round(step["step_s"]) for step in opened["clock_steps"]])
+    assert shown == [[10], [10, -10], [10, -10, 10]]
+
+
 def test_a_session_that_goes_on_after_a_boot_with_an_earlier_clock_is_flagged(rig: Rig) -> None:
     start(rig)
     rig.live(2)
