@@ -6,6 +6,8 @@ There is one function for each mode: live, simulated, replayed. No other module 
 from __future__ import annotations
 
 import contextlib
+import hashlib
+import json
 import re
 import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -32,7 +34,7 @@ from drivers.can.ports import CanLinkConfig, Interface
 from drivers.can_decoder import CanDecoder
 from drivers.can_link import CanLink
 from drivers.canopen.node_setup import NodeSetup
-from drivers.clock import Clock, ScaledClock, Stamp, SystemClock
+from drivers.clock import NS_PER_S, Clock, ScaledClock, Stamp, SystemClock
 from drivers.readings import Decoder, LinkLoop
 from drivers.stations.decoder import StationDecoder
 from drivers.stations.link import StationLink
@@ -46,6 +48,7 @@ _SIMULATED_RIG = "simulated-rig.toml"  # used if the configured rig has joints w
 
 Mode = Literal["live", "simulated", "replayed"]
 _SIMULATED_BOOT = "simulated-"
+_MACHINE = re.compile(f"{_SIMULATED_BOOT}[0-9a-f]{{8}}-[0-9a-f]{{8}}-")  # earlier versions did not name the machine
 _KERNEL_BOOT = re.compile(r"[0-9a-f]{8}(-[0-9a-f]{4}){3}-[0-9a-f]{12}")  # random(4)
 
 
@@ -106,17 +109,38 @@ def live(
     return _parts("live", config, source, clock or SystemClock(), aim=aim)
 
 
-def require_apart(boots: Sequence[str], store: Path, *, is_simulated: bool) -> None:
-    """Refuse to mix records of a real and a simulated machine in one store: models would be made of both.
+def simulated_machine(rig: str, seed: int, effects: Sequence[str], *, has_secret: bool) -> str:
+    """Return the beginning of the boot ids of a simulated machine, which differs from that of any other machine.
+
+    Args:
+        rig: name of the rig.
+        seed: seed of the machine.
+        effects: its hidden effects, in the simulator's spelling.
+        has_secret: whether it draws one further effect.
+    """
+    told = json.dumps([rig, seed, sorted(effects), has_secret])
+    return f"{_SIMULATED_BOOT}{hashlib.sha256(told.encode()).hexdigest()[:8]}-"
+
+
+def require_apart(boots: Sequence[str], store: Path, machine: str | None) -> None:
+    """Refuse to mix records of different machines in one store: models would be made of both.
 
     Args:
         boots: boot ids in the store.
         store: path of the store.
-        is_simulated: whether a simulated rig is about to run on the store.
+        machine: the simulated machine that is about to run on the store (`simulated_machine`); None for the real one.
 
     Raises:
-        CommandError: the store holds records of the other kind.
+        CommandError: the store holds records of a real machine and the present one is simulated, or the reverse, or of
+            a different simulated machine.
     """
+    is_simulated = machine is not None
+    if machine and any(_MACHINE.match(boot) and not boot.startswith(machine) for boot in boots):
+        raise CommandError(
+            f"{store} was measured on a different simulated machine; start that one again with its --rig, --seed and "
+            f"--effect, or move {store.parent} away for a new one",
+            REFUSED,
+        )
     if is_simulated and any(_KERNEL_BOOT.fullmatch(boot) for boot in boots):
         raise CommandError(
             f"{store} holds records of a real machine, which must not be mixed with simulated ones; give --config a "
@@ -142,6 +166,7 @@ def simulated(
     secret: Path | None = None,
     dwell_s: float,
     is_by_hand: bool = False,
+    after_utc_ns: int = 0,
 ) -> Iterator[Parts]:
     """Compose a simulated rig that runs in its own process and uses real protocols, under the configured link names.
 
@@ -154,10 +179,13 @@ def simulated(
         secret: directory in which the simulator records one further effect that it draws; None for no such effect.
         dwell_s: how long the boom stands still at each pose, in simulated seconds.
         is_by_hand: boom and station move only on command, in place of an operator's hands.
+        after_utc_ns: end of the last run on the store: simulated time, which may have run fast, begins after it.
     """
+    machine = simulated_machine(source.rig.name, seed, effects, has_secret=secret is not None)
     source, config = _with_devices(source, config)
     now = SystemClock().now()
-    clock = ScaledClock(rate, Stamp(now.utc_ns, now.monotonic_ns, f"{_SIMULATED_BOOT}{uuid.uuid4()}"))
+    utc_ns = max(now.utc_ns, after_utc_ns + NS_PER_S)
+    clock = ScaledClock(rate, Stamp(utc_ns, now.monotonic_ns, f"{machine}{uuid.uuid4()}"))
     ports = config.state_directory / "ports"
     ports.mkdir(parents=True, exist_ok=True)
     if len(config.can) > 1 or len(config.station) > 1:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import csv
+import re
 import select
 import shutil
 import sys
@@ -22,6 +23,7 @@ from daemon.host.safe_output import shown
 LOOK_S = 0.2
 GO_ON = "`rigcal session guide` resumes it"
 _BAR = 20  # characters
+_NUMBER = re.compile(r"\d+(\.\d+)?")
 
 Say = Callable[..., Mapping[str, Any]]
 """Sends a `guide.*` command with its arguments, and returns the guide's state."""
@@ -66,6 +68,8 @@ def lead(say: Say) -> Mapping[str, Any]:
         if sys.stdin.isatty() and sys.stdout.isatty():
             return _lead_watched(say)
         return _lead_in_lines(say)
+    except CommandError as error:
+        raise CommandError(f"{error}; an open guide is kept, and {GO_ON}", error.status) from error
     except KeyboardInterrupt:
         echo()
         echo(f"the guide stays open; {GO_ON}")
@@ -73,7 +77,10 @@ def lead(say: Say) -> Mapping[str, Any]:
 
 
 def _lead_in_lines(say: Say) -> Mapping[str, Any]:
-    """Print each step, its targets and its messages once; print a message again if it returns after a different one."""
+    """Print each step, its targets and its messages once; print a message again if it returns after a different one.
+
+    A message in which only numbers change, such as an age, is not printed again.
+    """
     told: list[str] = []
     warned: list[str] = []
     while True:
@@ -82,10 +89,10 @@ def _lead_in_lines(say: Say) -> Mapping[str, Any]:
         how = f" (`rigcal session guide --done`: {step['button']})" if step["button"] else ""
         lines = [f"{step['title']}: {step['instruction']}{how}", *_target_lines(guide)]
         messages = [f"  {message['severity']}: {message['text']}" for message in guide["messages"]]
-        new = [line for line in messages if line not in warned]
+        new = [line for line in messages if _NUMBER.sub("", line) not in warned]
         for line in (*(line for line in lines if line not in told), *new):
             echo(line)
-        told, warned = lines, messages if new else warned
+        told, warned = lines, [_NUMBER.sub("", line) for line in messages] if new else warned
         if guide["state"] != "open":
             return guide
         time.sleep(LOOK_S)

@@ -136,6 +136,14 @@ class Store(Connection):
         db.execute(f"UPDATE gaps SET {settings} WHERE end_utc_ns IS NULL", [*ended.values()])
         self.insert_records([Gap(WHOLE_DAEMON, GapReason.NOT_RUNNING, since, now)])
 
+    def last_utc_ns(self) -> int:
+        """Return the latest UTC that an earlier run of the daemon has stored, in ns; 0 for a new store."""
+        runs = "SELECT max(alive_utc_ns, coalesce(ended_utc_ns, 0)) AS utc_ns FROM daemon_runs ORDER BY id DESC LIMIT 1"
+        chunks = "SELECT last_utc_ns AS utc_ns FROM raw_chunks ORDER BY id DESC LIMIT 1"
+        return self.unless_damaged(
+            lambda: max((row["utc_ns"] for sql in (runs, chunks) for row in self.rows(sql)), default=0), 0
+        )
+
     def note_alive(self, until: Stamp) -> None:
         """Record the instant up to which all received data are stored; only later data can be lost.
 

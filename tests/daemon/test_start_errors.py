@@ -7,17 +7,20 @@ import os
 import resource
 import subprocess
 import sys
+import uuid
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from daemon.commands import REFUSED, CommandError
-from daemon.composition import Parts, joiner, require_apart
-from daemon.config.config import Config
+from daemon.composition import Parts, joiner, require_apart, simulated, simulated_machine
+from daemon.config.config import Config, read_config
+from daemon.rig_files import load_rig
 from daemon.service import Daemon
 from daemon.store import Store, StoreError
-from drivers.clock import SystemClock
+from drivers.clock import NS_PER_S, SystemClock
 from tests.daemon.support.damage import fill, small_disk
 from tests.daemon.support.jobs import SOURCE
 
@@ -126,7 +129,35 @@ def test_a_simulated_rig_and_a_real_machine_have_no_store_together(tmp_path: Pat
     ended = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
     assert ended.returncode == REFUSED, ended.stderr
     assert "holds records of a real machine" in ended.stderr
-    require_apart(["boot-a"], tmp_path, is_simulated=True)
-    require_apart(["simulated-1"], tmp_path, is_simulated=True)
+    machine = simulated_machine("swdt82", 1, (), has_secret=False)
+    require_apart(["boot-a"], tmp_path, machine)
+    require_apart(["simulated-1", f"simulated-{uuid.uuid4()}", f"{machine}{uuid.uuid4()}"], tmp_path, machine)
     with pytest.raises(CommandError, match="records of a simulated rig"):
-        require_apart(["simulated-1"], tmp_path, is_simulated=False)
+        require_apart(["simulated-1"], tmp_path, None)
+
+
+def test_a_store_of_another_simulated_machine_is_refused() -> None:
+    machine = ("swdt82", 1, ["backlash@theta4"], False)
+    others = [("ur10", *machine[1:]), ("swdt82", 2, *machine[2:]), ("swdt82", 1, [], False), (*machine[:3], True)]
+    name, *rest = (simulated_machine(*m[:3], has_secret=m[3]) for m in (machine, *others))
+    for other in rest:
+        with pytest.raises(CommandError, match="was measured on a different simulated machine; start that one again"):
+            require_apart([f"{other}{uuid.uuid4()}"], Path("rigcal.sqlite"), name)
+    require_apart([f"{name}{uuid.uuid4()}"], Path("rigcal.sqlite"), name)
+
+
+def test_simulated_time_that_ran_fast_does_not_run_backwards_at_the_next_start(tmp_path: Path) -> None:
+    config = tmp_path / "rigcal.toml"
+    config.write_text(CONFIG.format(state=tmp_path) + '[[station]]\nserial.path = "/dev/none"\n', encoding="utf-8")
+    parsed, source = read_config(config), load_rig("swdt82")
+    ahead_ns = SystemClock().now().utc_ns + 3600 * NS_PER_S
+    settings: dict[str, Any] = {"rate": 20.0, "seed": 1, "effects": (), "dwell_s": 4.0}
+    with simulated(parsed, source, **settings, after_utc_ns=ahead_ns) as parts:
+        now = parts.clock.now()
+        assert now.utc_ns > ahead_ns
+    path = tmp_path / "rigcal.sqlite"
+    with contextlib.closing(Store(path)) as store:
+        assert store.last_utc_ns() == 0
+        store.begin_run(now)
+        store.note_alive(now.shifted(NS_PER_S))
+        assert store.last_utc_ns() == now.utc_ns + NS_PER_S

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import secrets
+import signal
+import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -66,7 +69,7 @@ def demo(out: Path, rate: float, seed: int | None, *, is_hidden: bool, as_json: 
     started = time.monotonic()
     _make_room(out)
     total, done = hidden.steps() if is_hidden else _steps(), 0
-    with progress_display(as_json=as_json) as progress:
+    with _ended_by_sigterm(), progress_display(as_json=as_json) as progress:
 
         def advance(text: str, n: int) -> None:
             nonlocal done
@@ -83,6 +86,16 @@ def demo(out: Path, rate: float, seed: int | None, *, is_hidden: bool, as_json: 
     if not as_json:
         (hidden.show if is_hidden else _show)(result)
     return result
+
+
+@contextlib.contextmanager
+def _ended_by_sigterm() -> Iterator[None]:
+    """Raise SystemExit on SIGTERM, so that the daemon and its simulated rig end too."""
+    before = signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def _calibrate(out: Path, rate: float, seed: int, advance: Advance) -> dict[str, Any]:
@@ -154,6 +167,16 @@ def _make_room(out: Path) -> None:
             )
         import shutil
 
+        from daemon.store.errors import StoreBusyError
+        from daemon.store.files import WriterLock
+
+        try:
+            WriterLock(out / "rigcal.sqlite").release()
+        except StoreBusyError as error:
+            holder = "" if error.pid is None else f" (process {error.pid})"
+            raise click.UsageError(
+                f"a demo is running in {out}{holder}; wait for its end, or name a different directory with --out"
+            ) from error
         shutil.rmtree(out)
     out.mkdir(parents=True, exist_ok=True)
 

@@ -88,11 +88,12 @@ def run(
     """Run the daemon until it is stopped.
 
     SIGTERM or Ctrl-C stops it, or the end of a replay. A replay writes its store to a new directory within the
-    configured state directory. A simulated rig is refused on the store of a real rig, and the reverse.
+    configured state directory. A simulated rig is refused on the store of a real rig or of another simulated machine,
+    and a real rig on that of a simulated one.
     """
     if not sim and (is_by_hand or rig is not None):
         raise click.UsageError("--rig and --by-hand are for a simulated rig: give --sim as well")
-    from daemon.composition import live, replayed, simulated
+    from daemon.composition import live, replayed, simulated, simulated_machine
     from daemon.config.config import read_config
     from daemon.rig_files import load_rig
     from daemon.service import Daemon, stop_on_signals
@@ -118,9 +119,10 @@ def run(
         with notifier.extending(f"opening the store {settings.store_path}"):
             _make_directory(settings)
             # Open the store first: its lock prevents a second daemon from interfering with the first.
-            store = stack.enter_context(contextlib.closing(_store(settings, is_simulated=sim)))
+            machine = simulated_machine(source.rig.name, seed, effects, has_secret=secret is not None) if sim else None
+            store = stack.enter_context(contextlib.closing(_store(settings, machine)))
             if sim:
-                machine = simulated(
+                rig_parts = simulated(
                     settings,
                     source,
                     rate=rate,
@@ -129,8 +131,9 @@ def run(
                     secret=secret,
                     dwell_s=dwell_s,
                     is_by_hand=is_by_hand,
+                    after_utc_ns=store.last_utc_ns(),
                 )
-                parts = stack.enter_context(machine)
+                parts = stack.enter_context(rig_parts)
                 if config is None:
                     _write_config(settings, parts.rig_name)
             elif is_replay:
@@ -144,14 +147,14 @@ def run(
     return {"rig": source.rig.name, "mode": parts.mode, "store": str(settings.store_path)}
 
 
-def _store(settings: Config, *, is_simulated: bool) -> Store:
-    """Open the store for writing; CommandError if its records are real and the run is simulated, or the reverse."""
+def _store(settings: Config, machine: str | None) -> Store:
+    """Open the store for writing; CommandError if its records are of another machine, as in `require_apart`."""
     from daemon.composition import require_apart
     from daemon.store.store import Store
 
     store = Store(settings.store_path)
     try:
-        store.unless_damaged(lambda: require_apart(store.boots(), store.path, is_simulated=is_simulated), None)
+        store.unless_damaged(lambda: require_apart(store.boots(), store.path, machine), None)
     except BaseException:
         store.close()
         raise

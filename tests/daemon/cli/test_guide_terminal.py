@@ -94,15 +94,28 @@ def test_off_a_terminal_targets_are_printed_and_a_warning_once_until_it_changes(
 ) -> None:
     monkeypatch.setattr(sys, "stdin", io.StringIO())
     monkeypatch.setattr(guide_terminal, "LOOK_S", 0.0)
-    states = [at_a_pose("fog"), at_a_pose(), at_a_pose("fog"), at_a_pose("rain"), at_a_pose() | {"state": "finished"}]
+    silent = [at_a_pose(f"theta1 was read {age_s} s ago") for age_s in (3, 4, 5)]
+    states = [at_a_pose("fog"), at_a_pose(), at_a_pose("fog"), at_a_pose("rain"), *silent]
+    states.append(at_a_pose() | {"state": "finished"})
     coming = iter(states)
     assert lead(lambda _command, **_arguments: {"guide": next(coming)})["state"] == "finished"
     lines = capsys.readouterr().out.splitlines()
     assert [line for line in lines if "fog" in line] == ["  warning: fog"]
     assert "  warning: rain" in lines
+    assert [line for line in lines if "was read" in line] == ["  warning: theta1 was read 3 s ago"]
     (targets,) = (line for line in lines if line.startswith("  targets: "))
     for joint in RIG.joints:
         assert f"{joint.name} {MIDDLE[joint.name]:.1f} {joint.unit}" in targets
+
+
+def test_who_loses_the_daemon_is_told_that_the_guide_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "stdin", io.StringIO())
+
+    def gone(_command: str, **_arguments: Any) -> Any:
+        raise CommandError("no daemon is listening")
+
+    with pytest.raises(CommandError, match="no daemon is listening; an open guide is kept, and `rigcal session guide`"):
+        lead(gone)
 
 
 def test_who_has_measured_all_is_told_that_the_jobs_need_nobody() -> None:
