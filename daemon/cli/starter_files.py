@@ -53,7 +53,8 @@ def configuration(
 # Name of a shipped rig (swdt82, ys100, ur10), or path of a rig file relative to this file.
 rig = {quoted(rig)}
 
-# Directory of store, models and reports; the service's default is /var/lib/rigcal.
+# Directory of store, models and reports; /var/lib/rigcal without this line. `rigcal run` without the service puts its
+# control socket there, which other commands need: --socket DIRECTORY/control.sock.
 # state_directory = "/var/lib/rigcal"
 
 # Members of this group have read-only access to the daemon.

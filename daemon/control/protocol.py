@@ -197,7 +197,7 @@ def unreachable(path: Path, error: OSError) -> CommandError:
     """Return the error of a client that finds no daemon at a socket."""
     return CommandError(
         f"no daemon is listening at {path} ({error.strerror or error}); start one with `rigcal run`, "
-        "or name its socket with --socket (`rigcal run --sim` uses rigcal-sim/control.sock)",
+        "or name its socket with --socket: `rigcal run` logs it at its start (--sim uses rigcal-sim/control.sock)",
         FAILED,
     )
 
