@@ -10,7 +10,7 @@ from drivers.can.error_frames import BusErrors
 from drivers.can.j1939 import J1939Id
 from drivers.can.summary import CanSummary, IdSummary, RateWindow
 from drivers.canopen.cia301 import Service, classify
-from drivers.canopen.pdo import PdoChannelDecoder
+from drivers.canopen.pdo_channel import PdoChannelDecoder
 from drivers.canopen.supervision import NodeSupervision
 from drivers.canopen.sync import SYNC_ID, SyncSampling
 from drivers.clock import NS_PER_S, Stamp

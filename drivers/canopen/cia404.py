@@ -6,7 +6,7 @@ import struct
 from dataclasses import dataclass
 
 from drivers.can.channel import value_reading
-from drivers.canopen.pdo import PdoChannel, PdoChannelDecoder
+from drivers.canopen.pdo_channel import PdoChannel, PdoChannelDecoder
 from drivers.clock import Stamp
 from drivers.errors import DescriptionError
 from drivers.jumps import checked_reading, joint_watch

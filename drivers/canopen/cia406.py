@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from drivers.canopen.pdo import PdoChannel, PdoChannelDecoder
+from drivers.canopen.pdo_channel import PdoChannel, PdoChannelDecoder
 from drivers.clock import Stamp
 from drivers.errors import DescriptionError
 from drivers.jumps import JumpWatch, jump_event

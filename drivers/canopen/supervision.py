@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from drivers.canopen.cia301 import NmtState, decode_heartbeat, emcy_id, heartbeat_id, sdo_response_id
 from drivers.canopen.emcy import decode_emergency
-from drivers.canopen.pdo import PdoChannelDecoder
+from drivers.canopen.pdo_channel import PdoChannelDecoder
 from drivers.canopen.sdo import UploadResponse, decode_response
 from drivers.clock import NS_PER_S, Stamp
 from drivers.readings import DecodeFailure, DeviceEvent, EventKind, Record

@@ -54,7 +54,7 @@ class Measured:
         self._file.write_text(json.dumps(everything, indent=1, sort_keys=True) + "\n", encoding="utf-8")
 
     def state(self, target: Target) -> str:
-        """Return the SHA-256 of all sources that a target may run: its module, and what that imports."""
+        """Return the SHA-256 of all sources that a target runs: its module, and what that imports."""
         module = target.prepare.__module__
         reached = {
             name
@@ -65,9 +65,6 @@ class Measured:
         for name in sorted(reached):
             place = Path(*name.split("."))
             files.add(f"{place}.py" if (ROOT / f"{place}.py").exists() else f"{place}/__init__.py")
-            # A folder within a room counts whole: its other modules may run in a process of their own.
-            if len(place.parts) > 2 and place.parts[0] != "tests":
-                files |= {str(path.relative_to(ROOT)) for path in (ROOT / place.parent).glob("*") if path.is_file()}
         return Passed("fuzz", files).state()
 
     def _read(self) -> dict[str, dict[str, Any]]:

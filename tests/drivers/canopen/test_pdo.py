@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.canopen.pdo import PdoMapping, TransmitPdo, _first_bad_line
+from drivers.canopen.eds import _first_bad_line
+from drivers.canopen.pdo import PdoMapping, TransmitPdo
 from drivers.errors import DescriptionError
 from tests.drivers.can_support import EDS
 

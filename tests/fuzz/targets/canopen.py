@@ -11,7 +11,7 @@ from daemon.rig_files import load_rig
 from drivers.can.frame import Frame
 from drivers.canopen.cia301 import classify
 from drivers.canopen.node_setup import SetupRunner
-from drivers.canopen.pdo import PdoChannelDecoder
+from drivers.canopen.pdo_channel import PdoChannelDecoder
 from drivers.canopen.sdo import Download, SdoExchange, Upload, decode_response
 from drivers.canopen.supervision import NodeSupervision
 from drivers.errors import DeviceError
