@@ -6,7 +6,7 @@ import csv
 import hashlib
 import io
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -73,7 +73,8 @@ class Observations:
         ignored_numbers: the ignored columns that hold numbers, which a signal of the rig file could use.
         row_numbers: (n,) number of the line or row that each row was read from (`row_name`); None for rows that were
             made in a program.
-        place: what `row_numbers` count: lines of a file, whose header is line 1, or rows of a data frame, from 0.
+        place: how rows are named: by `row_numbers`, as lines of a file, whose header is line 1, or as rows of a data
+            frame, from 0; or by pose and session, for data of a daemon.
     """
 
     prism: Strings
@@ -158,9 +159,23 @@ class Observations:
         return row if self.row_numbers is None else int(self.row_numbers[row])
 
     def row_name(self, *rows: int) -> str:
-        """Return the name of rows, given from 0, for messages: `line 17`, `lines 17, 43`, `row 16 (from 0)`."""
+        """Return the name of rows, given from 0, for messages: `line 17`, `lines 17, 43`, `row 16 (from 0)`.
+
+        Fixes of a daemon have no file that people know: `pose 1.17 of session s001-r`.
+        """
+        if self.place == "pose":
+            return self._pose_names(rows)
         numbers = ", ".join(str(self.row_number(row)) for row in rows)
         return f"{self.place}{'s' if len(rows) > 1 else ''} {numbers}{' (from 0)' if self.place == 'row' else ''}"
+
+    def _pose_names(self, rows: Sequence[int]) -> str:
+        poses: dict[str, dict[str, None]] = {}
+        for row in rows:
+            poses.setdefault(str(self.session[row]), {})[str(self.pose[row]) or "(unnamed)"] = None
+        return ", ".join(
+            f"pose{'s' if len(names) > 1 else ''} {', '.join(names)} of session {session}"
+            for session, names in poses.items()
+        )
 
     def groups(self) -> Strings:
         """Return (n,) labels for grouped splits: sessions if there are several, else set-ups, else workspace cells.

@@ -22,7 +22,7 @@ from calibration.rig.signals import is_read_anyway
 Floats = NDArray[np.float64]
 Strings = NDArray[np.str_]
 
-Place = Literal["line", "row"]
+Place = Literal["line", "row", "pose"]
 """How messages number rows: by the line of the file, from 1, or by the row of the data frame, from 0."""
 
 POSITION_COLUMNS = names(POSITION)

@@ -34,7 +34,7 @@ from drivers.can.ports import CanLinkConfig, Interface
 from drivers.can_decoder import CanDecoder
 from drivers.can_link import CanLink
 from drivers.canopen.node_setup import NodeSetup
-from drivers.clock import NS_PER_S, Clock, ScaledClock, Stamp, SystemClock
+from drivers.clock import NS_PER_S, SIMULATED_BOOT, Clock, ScaledClock, Stamp, SystemClock
 from drivers.readings import Decoder, LinkLoop
 from drivers.stations.decoder import StationDecoder
 from drivers.stations.link import StationLink
@@ -47,8 +47,7 @@ SIMULATED_SYNC_MS = 200
 _SIMULATED_RIG = "simulated-rig.toml"  # used if the configured rig has joints without a channel
 
 Mode = Literal["live", "simulated", "replayed"]
-_SIMULATED_BOOT = "simulated-"
-_MACHINE = re.compile(f"{_SIMULATED_BOOT}[0-9a-f]{{8}}-[0-9a-f]{{8}}-")  # earlier versions did not name the machine
+_MACHINE = re.compile(f"{SIMULATED_BOOT}[0-9a-f]{{8}}-[0-9a-f]{{8}}-")  # earlier versions did not name the machine
 _KERNEL_BOOT = re.compile(r"[0-9a-f]{8}(-[0-9a-f]{4}){3}-[0-9a-f]{12}")  # random(4)
 
 
@@ -119,7 +118,7 @@ def simulated_machine(rig: str, seed: int, effects: Sequence[str], *, has_secret
         has_secret: whether it draws one further effect.
     """
     told = json.dumps([rig, seed, sorted(effects), has_secret])
-    return f"{_SIMULATED_BOOT}{hashlib.sha256(told.encode()).hexdigest()[:8]}-"
+    return f"{SIMULATED_BOOT}{hashlib.sha256(told.encode()).hexdigest()[:8]}-"
 
 
 def require_apart(boots: Sequence[str], store: Path, machine: str | None) -> None:
@@ -147,7 +146,7 @@ def require_apart(boots: Sequence[str], store: Path, machine: str | None) -> Non
             "file with a different state_directory, or omit it",
             REFUSED,
         )
-    if not is_simulated and any(boot.startswith(_SIMULATED_BOOT) for boot in boots):
+    if not is_simulated and any(boot.startswith(SIMULATED_BOOT) for boot in boots):
         raise CommandError(
             f"{store} holds records of a simulated rig, which must not be mixed with a real machine's; move "
             f"{store.parent} away, or set a different state_directory",

@@ -11,6 +11,8 @@ from typing import Protocol
 
 NS_PER_S = 1_000_000_000
 
+SIMULATED_BOOT = "simulated-"  # beginning of the boot ids of simulated rigs
+
 _TIGHT_NS = 20_000  # three clock readings within this time were not interrupted; they normally take a tenth of it
 _READINGS = 8
 

@@ -36,6 +36,7 @@ _BOTH = 1.1  # sum of the posteriors of two effects from which on both are prese
 _RELEVANT = 0.1  # share of the leading log Bayes factor below which a candidate is irrelevant to the leading one
 _COMPARED = 30  # smallest number of candidates to compare
 _SAME_FAMILY = 2  # other variants and places of a family that a plan also distinguishes from other effects
+_OVERWHELMING = 50.0  # log odds beyond which their size means nothing to people
 _HALF_SAMPLES = 25
 _FOLDS = 10
 
@@ -196,9 +197,15 @@ def with_finer(
 
 def odds_text(best: ScoredEffect, other: ScoredEffect) -> str:
     """Return a clause that states by what factor the best candidate explains the data better than another."""
-    log_odds = best.log_bayes_factor - other.log_bayes_factor
+    return better_text(str(best.candidate), best.log_bayes_factor - other.log_bayes_factor)
+
+
+def better_text(name: str, log_odds: float) -> str:
+    """Return a clause that states how much better a candidate explains the data, from the log odds."""
+    if log_odds > _OVERWHELMING:
+        return f"{name} explains the data overwhelmingly better"
     times = f"e^{log_odds:.0f}" if log_odds > math.log(1000.0) else f"{math.exp(max(log_odds, 0.0)):.0f}"
-    return f"{best.candidate} explains the data {times} times better"
+    return f"{name} explains the data {times} times better"
 
 
 def half_sample_wins(

@@ -20,6 +20,7 @@ from calibration.rig.signals import how_to_use
 
 # Of observations.
 _GOOD = 2  # fixes per parameter; with more, build tolerances matter little
+_COUNTED = "(a pose counts once for each prism)"
 _FAR_MM = 5e5  # from the instrument; no boom is measured from farther away
 _LIGHT, _HEAVY = 1e-3, 10.0  # plausible range of the payload, as a factor of the machine's mass
 _TOO_FAST = 3.0  # times the fastest motion of a joint
@@ -80,10 +81,13 @@ def require_enough(rig: Rig, observations: Observations, different: int | None =
     fixes = len(observations)
     different = fixes if different is None else different
     if 3 * different < parameters:
-        repeats = f", repeats counted once of {fixes}," if different < fixes else ""
-        there_are = f"1 different fix{repeats} has" if different == 1 else f"{different} different fixes{repeats} have"
+        if different < fixes:
+            counted = f"{different} different pose{'s' * (different != 1)} among {fixes} fixes {_COUNTED}"
+        else:
+            counted = f"{fixes} fix{'es' * (fixes != 1)}"
+        has = "has" if different == 1 else "have"
         raise UnsafeError(
-            f"{there_are} {3 * different} coordinates, which cannot determine {parameters} parameters; "
+            f"{counted} {has} {3 * different} coordinates, which cannot determine {parameters} parameters; "
             f"{_how_many(parameters)}"
         )
 
@@ -113,8 +117,8 @@ def data_warnings(observations: Observations, chain: Chain, different: int) -> I
     yield from _warn_of_ignored(chain.rig, observations)
     if different < len(chain):
         yield (
-            f"{different} different fixes are few for {len(chain)} parameters: much of the model depends on build "
-            f"tolerances alone; {_how_many(len(chain))}"
+            f"{different} different poses {_COUNTED} are few for {len(chain)} parameters: much of the model depends on "
+            f"build tolerances alone; {_how_many(len(chain))}"
         )
 
 

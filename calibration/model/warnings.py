@@ -158,7 +158,7 @@ def _of_residual(model: CalibratedModel, observations: Observations) -> Iterator
 def farthest(observations: Observations, outliers: Sequence[Outlier]) -> str:
     """Return a clause that describes one or more outliers: their size, and the rows of the farthest."""
     worst = sorted(outliers, key=lambda outlier: -outlier.sigma)
-    rows = observations.row_name(*(outlier.row for outlier in worst[:_LISTED]))
+    rows = observations.row_name(*sorted(outlier.row for outlier in worst[:_LISTED]))
     more = f" and {len(worst) - _LISTED} more" if len(worst) > _LISTED else ""
     return f"up to {worst[0].sigma:,.0f} sigma off, in {rows}{more}"
 

@@ -58,7 +58,7 @@ def pde_paper(rig: Rig, observations: Observations, *, prior: Prior, run: Run) -
     different = different_fixes(chain, samples)
     if 3 * different < rows.sum():
         raise UnsafeError(
-            f"{different} different fixes cannot determine {rows.sum()} constants of the rows; measure more poses"
+            f"{different} different poses cannot determine {rows.sum()} constants of the rows; measure more poses"
         )
     objective = _objective(chain, samples, rows, nominal.x)
     evolved = search(objective, bounds(chain, prior)[rows], run=run.part(0.05, 0.9))

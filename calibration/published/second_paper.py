@@ -176,7 +176,7 @@ def _iterated(chain: Chain, samples: Samples, start: Floats, compliances: _Compl
     different = different_fixes(chain, samples)
     if 3 * different <= seen.shape[1]:
         raise UnsafeError(
-            f"{different} different fixes cannot determine {seen.shape[1]} parameters by least squares; "
+            f"{different} different poses cannot determine {seen.shape[1]} parameters by least squares; "
             f"measure at least {seen.shape[1] // 3 + 1}"
         )
     rounds, converged = 0, False

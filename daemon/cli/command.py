@@ -80,12 +80,21 @@ class Command(click.Command):
             _refuse_empty(args)
             return super().make_context(info_name, args, parent, **extra)
         except click.UsageError as error:
+            told = self._with_value(error)
             if as_json:
-                print_json({"error": error_sentence(error), "kind": type(error).__name__})
-            sentence = error.format_message()
-            if shown_lines(sentence) == sentence:
+                print_json({"error": error_sentence(told), "kind": type(error).__name__})
+            sentence = told.format_message()
+            if told is error and shown_lines(sentence) == sentence:
                 raise
             raise click.UsageError(shown_lines(sentence), error.ctx) from None
+
+    def _with_value(self, error: click.UsageError) -> click.UsageError:
+        """Return an error; one about an option without its value shows how that value is called."""
+        if not isinstance(error, click.BadOptionUsage) or not error.message.endswith("requires an argument."):
+            return error
+        name = error.option_name
+        values = [p.metavar or "VALUE" for p in self.params if name in p.opts and isinstance(p, click.Option)]
+        return click.UsageError(f"Option {name} needs a value: {name} {values[0]}", error.ctx) if values else error
 
     def invoke(self, ctx: click.Context) -> Any:
         as_json = bool(ctx.params.get("as_json"))

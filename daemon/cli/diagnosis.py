@@ -10,12 +10,13 @@ import json
 import os
 import shutil
 import subprocess
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from drivers.can.bus_options import slcan_port
+from drivers.readings import GapReason
 
 if TYPE_CHECKING:
     from daemon.config.config import Config
@@ -29,6 +30,7 @@ _USUAL_RATE = 250_000  # bit/s
 _RULES_FILE = "/etc/udev/rules.d/99-rigcal-station.rules"
 _RELOAD_RULES = "`udevadm control --reload && udevadm trigger`"
 _OFTEN = 10  # number of silences of a channel since the start that suggests a too short timeout
+_CHANNELS_NAMED = 5  # of those that fall silent repeatedly
 _LEAST_FREE = 0.1  # share of the disk
 _BUSY = 1.5  # runnable processes per processor, averaged over the last minute
 _TIME_ERROR = 5  # adjtimex(2): the clock is not synchronised
@@ -303,13 +305,19 @@ def daemon_state(status: Mapping[str, Any], version: str) -> Iterator[Finding]:
     for station in acquisition["stations"]:
         yield _station(station)
     yield from _time_outs(acquisition)
-    alarms = status["alarms"]["active"]
-    if alarms:
-        is_critical = any(alarm["severity"] == "critical" for alarm in alarms)
-        named = ", ".join(f"{alarm['kind']} {alarm['subject']}" for alarm in alarms)
-        yield Finding("alarms", "fault" if is_critical else "warning", named, "`rigcal alarms` shows what to do")
-    else:
+    yield from _alarms(status["alarms"]["active"])
+
+
+def _alarms(active: Sequence[Mapping[str, Any]]) -> Iterator[Finding]:
+    """List critical alarms as a fault, and the others as a warning."""
+    if not active:
         yield Finding("alarms", "good", "none")
+    states: tuple[tuple[State, bool], ...] = (("fault", True), ("warning", False))
+    for state, is_critical in states:
+        alarms = [alarm for alarm in active if (alarm["severity"] == "critical") is is_critical]
+        if alarms:
+            named = ", ".join(f"{alarm['kind']} {alarm['subject']}" for alarm in alarms)
+            yield Finding("alarms", state, named, "`rigcal alarms` shows what to do")
 
 
 def _link(link: Mapping[str, Any]) -> Finding:
@@ -342,12 +350,21 @@ def _channels(channels: list[Mapping[str, Any]]) -> Iterator[Finding]:
 
 
 def _station(station: Mapping[str, Any]) -> Finding:
+    from daemon.acquisition.status.present import LINK_DOWN, SILENT, STARTING
+
     name = f"station {station['name']}"
     if station["age_s"] is None:
         remedy = "check its power, cable, baud and profile ([station] of the configuration)"
         return Finding(name, "fault", "has not answered since the daemon's start", remedy)
-    state: State = "good" if station["status"] == "ok" else "warning"
-    return Finding(name, state, station["sentence"], "" if state == "good" else "aim it at the prism and lock it")
+    if station["status"] == "ok":
+        return Finding(name, "good", station["sentence"])
+    remedies = {
+        LINK_DOWN: "check the plug, the cable, and the power of adapter and station",
+        SILENT: "check its power and cable, and that it still measures",
+        STARTING: "wait some seconds; if nothing arrives, check its power and cable",
+    }
+    remedy = remedies.get(station["status"], "aim it at the prism and lock it")
+    return Finding(name, "warning", station["sentence"], remedy)
 
 
 def _time_outs(acquisition: Mapping[str, Any]) -> Iterator[Finding]:
@@ -357,11 +374,24 @@ def _time_outs(acquisition: Mapping[str, Any]) -> Iterator[Finding]:
         for gap in acquisition.get("gap_counts", ())
         if gap["reason"] == "silent" and gap["count"] >= _OFTEN
     }
-    for name, count in often.items():
-        remedy = (
-            f"check its cable; if the device is only slow, give channel {name} of the rig file a longer timeout_s "
-            "(for a station: silence_timeout_s)"
-        )
-        yield Finding(f"timeout of {name}", "warning", f"silent {count} times since the start", remedy)
     if not often:
         yield Finding("timeouts", "good", "no channel falls silent repeatedly")
+        return
+    worst = sorted(often, key=lambda name: -often[name])
+    named = ", ".join(f"{name} {often[name]} times" for name in worst[:_CHANNELS_NAMED])
+    more = f", and {len(worst) - _CHANNELS_NAMED} more" if len(worst) > _CHANNELS_NAMED else ""
+    yield Finding("timeouts", "warning", f"silent since the start: {named}{more}", _time_out_remedy(acquisition))
+
+
+def _time_out_remedy(acquisition: Mapping[str, Any]) -> str:
+    """Return what to do about channels that fall silent; an overloaded processor comes before the rig file."""
+    check = (
+        "check their cables; if a device is only slow, give its channel in the rig file a longer timeout_s (a station: "
+        "silence_timeout_s in the configuration)"
+    )
+    was_late = any(gap["reason"] == GapReason.TIME_DOUBTFUL for gap in acquisition.get("gap_counts", ()))
+    if overload() is None and not was_late and not any(link["dropped"] for link in acquisition["links"]):
+        return check
+    return (
+        f"an overloaded processor is the likely cause: relieve it first (`top` shows what is busy); otherwise {check}"
+    )

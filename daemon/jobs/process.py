@@ -13,7 +13,7 @@ import os
 import sys
 import threading
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -46,6 +46,7 @@ from daemon.report.gap.words import gap_headline
 from daemon.sessions.session_data import sessions_csv, sessions_measured, setup_lines
 from daemon.store.errors import StoreError
 from daemon.store.files import FileIdentity
+from daemon.store.queries.observations import stations_of
 from daemon.store.queries.sessions import session
 from daemon.store.reader import Reader
 from daemon.warm_up import prepare
@@ -206,9 +207,12 @@ def _report(order: Order, progress: Progress) -> dict[str, Any]:
     session_ids = (*order.train_ids, *order.session_ids)
     with _store(order) as reader:
         setups = setup_lines(reader, session_ids)
+        stations = {name: " and ".join(stations_of(reader, name)) for name in session_ids}
     facts = _facts(order, model, session_ids, directory.name)
     latencies = _latencies(order, model)
-    page = calibration_report(report_input(training, held_out, setups=setups, facts=facts, latencies=latencies))
+    page = calibration_report(
+        report_input(training, held_out, setups=setups, facts=facts, latencies=latencies, stations=stations)
+    )
     path = directory / REPORT
     write_file(path, page.encode())
     judged = held_out or training
@@ -322,7 +326,8 @@ def _rig_text(order: Order) -> str:
 def _observations(order: Order, rig: Rig, session_ids: tuple[str, ...]) -> Observations:
     with _store(order) as reader:
         data = sessions_csv(reader, rig, session_ids)
-    return parse_observations(data, rig, f"sessions {', '.join(session_ids)}")
+    # Nobody knows the lines of this table, so messages name fixes by pose and session.
+    return replace(parse_observations(data, rig, f"sessions {', '.join(session_ids)}"), place="pose")
 
 
 def _made(

@@ -21,6 +21,7 @@ from daemon.store.queries.models import ModelRow, ModelTable
 
 log = logging.getLogger(__name__)
 
+_CANNOT = "model {} cannot go live: "
 _Files = tuple[tuple[str, int, int], ...]
 
 
@@ -154,7 +155,7 @@ class ModelRegistry:
             self._reason_to_accept(model, live)
             self._require_loads(model)
         except CommandError as error:
-            refusal = str(error)
+            refusal = str(error).removeprefix(_CANNOT.format(model.id))  # `status` names the model already
         return _brief(model, live) | {"is_acceptable": refusal is None, "refused_because": refusal}
 
     # ---- parts -------------------------------------------------------------------------------------------------------
@@ -187,7 +188,7 @@ class ModelRegistry:
         try:
             self._live.load(model)
         except CalibrationError as error:
-            raise CommandError(f"model {model.id} cannot go live: {error}", REFUSED) from error
+            raise CommandError(f"{_CANNOT.format(model.id)}{error}", REFUSED) from error
 
     def _require_loads(self, model: ModelRow) -> None:
         """Do as `_load`, which takes a second, but only once for the same state of the model's files."""
@@ -224,7 +225,7 @@ class ModelRegistry:
             then = "no model was live" if compared["live"] is None else f"model {compared['live']} was live"
             raise CommandError(f"model {model.id} was compared when {then}, but {now}{again}", REFUSED)
         if not compared["is_better"]:
-            raise CommandError(f"model {model.id} cannot go live: {compared['sentence']}", REFUSED)
+            raise CommandError(f"{_CANNOT.format(model.id)}{compared['sentence']}", REFUSED)
         return str(compared["sentence"])
 
     def _changed(self, model: ModelRow, live: ModelRow | None) -> dict[str, Any]:

@@ -34,6 +34,7 @@ class Facts:
         measured_utc_ns: first and last instant of the measurement.
         made_utc_ns: time of the report; without it the same input gives the same bytes.
         tolerance_mm: permitted root mean square error; None if none is stated.
+        is_simulated: True if a simulated rig was measured.
     """
 
     rig: str
@@ -45,11 +46,13 @@ class Facts:
     measured_utc_ns: tuple[int, int] | None = None
     made_utc_ns: int | None = None
     tolerance_mm: float | None = None
+    is_simulated: bool = False
 
     def lines(self) -> dict[str, str]:
         """Return label -> text, in reading order."""
         return {
             "Rig": self.rig,
+            **({"Simulated": "measured on a simulated rig, in simulated time"} if self.is_simulated else {}),
             "Model": self.model or NOT_GIVEN,
             "Sessions": _listed(self.sessions),
             "Operator": _listed(self.operators),

@@ -21,6 +21,7 @@ from daemon.store.queries.sessions import OTHER_RIG_FILE, session
 from daemon.store.queries.setups import misclosures, setups_of
 from daemon.store.queries.time_axis import time_axis
 from daemon.store.reader import Reader
+from drivers.clock import SIMULATED_BOOT
 
 Misclosure = tuple[float, float, float]
 
@@ -72,6 +73,7 @@ class Measured:
         sessions, operators, instruments, setups: names, each once; an operator is the name given, or else the user
             name.
         measured_utc_ns: start of the first session and end of the last; None without any.
+        is_simulated: True if a simulated rig was measured, in simulated time.
     """
 
     sessions: tuple[str, ...]
@@ -79,6 +81,7 @@ class Measured:
     instruments: tuple[str, ...]
     setups: tuple[str, ...]
     measured_utc_ns: tuple[int, int] | None
+    is_simulated: bool
 
 
 def sessions_measured(reader: Reader, session_ids: Sequence[str]) -> Measured:
@@ -92,6 +95,7 @@ def sessions_measured(reader: Reader, session_ids: Sequence[str]) -> Measured:
         tuple(dict.fromkeys(" ".join(filter(None, (s["instrument"], s.get("serial")))) for s in setups)),
         tuple(setup["id"] for setup in setups),
         (min(instants), max(instants)) if instants else None,
+        any(reader.stamp(row, "started_").boot_id.startswith(SIMULATED_BOOT) for row in rows),
     )
 
 

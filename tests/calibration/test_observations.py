@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -221,6 +222,18 @@ def test_rows_keep_the_numbers_of_the_file_whatever_is_left_out() -> None:
     assert kept.row_number(0) == 14
     of_frame = Observations.from_frame(frame(), RIG).select(np.array([1]))
     assert of_frame.row_name(0) == "row 1 (from 0)"
+
+
+def test_fixes_of_a_daemon_are_named_by_pose_and_session() -> None:
+    found = replace(
+        parse("\n".join([HEADER, *[ROW] * 5]) + "\n"),
+        place="pose",
+        session=np.array(["s1", "s1", "s1", "s2", "s2"]),
+        pose=np.array(["1.2", "1.2", "1.3", "1.9", ""]),
+    )
+    assert found.row_name(0) == "pose 1.2 of session s1"
+    assert found.row_name(0, 1, 2, 3) == "poses 1.2, 1.3 of session s1, pose 1.9 of session s2"
+    assert found.select(np.array([4])).row_name(0) == "pose (unnamed) of session s2"
 
 
 def test_columns_of_a_data_frame_that_nothing_uses_are_told_apart() -> None:

@@ -141,6 +141,9 @@ def test_frames_that_the_kernel_dropped_while_the_link_was_held_up_are_a_gap_aro
             held_up.append(item)
             go_on.wait(DEADLINE_S)
 
+    def lost() -> list[Gap]:
+        return [gap for gap in heard.gaps if gap.reason is GapReason.FRAMES_LOST]
+
     with multicast_bus(port) as bus:
         thread = threading.Thread(target=multicast_link(port, receive_buffer_bytes=4096).run, args=(emit, stop))
         thread.start()
@@ -159,14 +162,14 @@ def test_frames_that_the_kernel_dropped_while_the_link_was_held_up_are_a_gap_aro
             heard.wait(lambda: len(heard.received) > quiet, "what the kernel kept")
             bus.send(message("1A0 FF"))
             heard.wait(lambda: heard.received[-1].data == b"\xff", "the last frame")
-            heard.wait(lambda: heard.gaps, "a gap")
+            heard.wait(lost, "a gap")
         finally:
             go_on.set()
             stop.set()
             thread.join(DEADLINE_S)
     assert not thread.is_alive()
-    (gap,) = heard.gaps
-    assert (gap.channel, gap.reason) == ("boom", GapReason.FRAMES_LOST)
+    (gap,) = lost()  # a busy computer may also make times doubtful
+    assert gap.channel == "boom"
     assert gap.missed == sent - len(heard.received) > 0
     assert gap.start.since(heard.received[-2].stamp) <= 0, "they were lost after the last frame that was kept"
     assert gap.end is not None

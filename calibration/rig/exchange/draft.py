@@ -42,6 +42,7 @@ class Draft:
         convention: convention of its rows.
         source: name of the imported file, for the first line of the rig file.
         notes: sentences about what was assumed and what was left out.
+        values_assumed: clauses about values that the imported file does not give.
         sections: `joint`, `row`, `prism` and `mass` -> tables.
     """
 
@@ -49,6 +50,7 @@ class Draft:
     convention: Convention
     source: str
     notes: list[str] = field(default_factory=list)
+    values_assumed: list[str] = field(default_factory=list)
     sections: dict[str, list[Section]] = field(
         default_factory=lambda: {name: [] for name in ("joint", "row", "prism", "mass")}
     )
@@ -62,7 +64,8 @@ class Draft:
         """A sentence that lists what was assumed because the imported description does not have it."""
         joints = [str(t.keys["name"]) for t in self.sections["joint"] if LIMITS_ASSUMED in t.remark]
         limits = f"the limits of {', '.join(joints)}, " if joints else ""
-        return f"Assumed: the random errors of readings (sigma), {limits}the build tolerances and the station."
+        always = f"the random errors of readings (sigma), {limits}the build tolerances and the station"
+        return f"Assumed: {'; '.join((always, *self.values_assumed))}."
 
     def text(self) -> str:
         """Return the TOML."""

@@ -29,6 +29,7 @@ from calibration.rig.exchange.draft import LIMITS_ASSUMED, SIGMA, Draft, free_na
 from calibration.rig.exchange.frames import tidy
 
 CONSTANTS = {"alpha": "deg", "a": "mm", "d": "mm", "theta": "deg", "beta": "deg", "b": "mm"}
+_OF_EVERY_TABLE = ("alpha", "a", "d", "theta")
 BEFORE = ("x_mm", "y_mm", "z_mm", "rz_deg", "ry_deg", "rx_deg")
 DRIVES = ("theta", "d", "a")
 PRISM = ("prism", "frame", "prism_x_mm", "prism_y_mm", "prism_z_mm")
@@ -83,6 +84,7 @@ class _Table:
         self._lines = [(number, line) for number, line in enumerate(lines, 1) if line.strip() and line[:1] != "#"]
         self._kinds: dict[str, str] = {}
         self._has_drives = False
+        self._constants: set[str] = set()
 
     def draft(self) -> Draft:
         draft, rows = self._draft, list(self._rows())
@@ -105,6 +107,11 @@ class _Table:
                 name = "tool" if not draft.sections["prism"] else f"tool_{end}"
                 keys = {"name": free_name(name, self._kinds), "frame": end, "offset_mm": [0.0, 0.0, 0.0]}
                 draft.add("prism", keys | {"offset_known": False}, "the position of the reflector is not known")
+        missing = [f"{name}_{CONSTANTS[name]} = 0" for name in _OF_EVERY_TABLE if name not in self._constants]
+        if missing:
+            said = " and ".join(filter(None, (", ".join(missing[:-1]), missing[-1])))
+            columns = "columns" if len(missing) > 1 else "column"
+            draft.values_assumed.append(f"{said} for all rows: the table has no such {columns}")
         draft.notes += [
             f"Convention: {self._convention}.",
             draft.assumed,
@@ -124,6 +131,7 @@ class _Table:
                     self._source, "header", "separate columns by commas, and use a point for decimals", first
                 )
             raise RigError(self._source, "header", f"{what}; possible columns: {', '.join(sorted(_KNOWN))}", first)
+        self._constants = {name.rpartition("_")[0] for name in names}
         self._has_drives = any(f"{driven}_drive" in names for driven in DRIVES)
         for number, line in lines:
             cells = [cell.strip() for cell in next(csv.reader(io.StringIO(line)))]

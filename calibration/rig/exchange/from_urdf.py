@@ -194,6 +194,12 @@ class _Import:
             limits = (-assumed / unit, assumed / unit)
             remark = "; ".join(filter(None, (remark, f"{LIMITS_ASSUMED}: the URDF gives none")))
         name = self._names[joint.name]
+        if limits == joint.limits and joint.missing_limit:
+            given = "upper" if joint.missing_limit == "lower" else "lower"
+            self._draft.values_assumed.append(
+                f"the {joint.missing_limit} limit 0 of {name}: the URDF gives only the {given} one"
+            )
+            remark = "; ".join(filter(None, (remark, f"{joint.missing_limit} limit assumed")))
         keys: dict[str, object] = {"name": name, "kind": joint.kind, "limits": [tidy(x * unit) for x in limits]}
         keys["sigma"] = SIGMA[joint.kind]
         if joint.max_rate is not None:

@@ -7,6 +7,7 @@ ignored.
 from __future__ import annotations
 
 import math
+import re
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
@@ -22,6 +23,8 @@ LONGEST = 1 << 24  # characters; a humanoid with the names of its meshes has som
 _MOST_ELEMENTS = 20_000
 _MOST_TAGS = 3 * _MOST_ELEMENTS  # an element has two, and may have a comment
 _LARGEST = 1e9  # largest number of metres or radians, and largest component of a direction
+_XACRO = "xacro that is not expanded; run `xacro FILE > ROBOT.urdf`, and import that"
+_EXPRESSION = re.compile(r"\$\{|\$\((?:arg|find|eval|env|optenv|dirname|anon)\b")
 _TURNING, _SLIDING, _FREE = ("revolute", "continuous"), ("prismatic",), ("floating", "planar")
 
 
@@ -60,6 +63,7 @@ class UrdfJoint:
         origin: (4, 4) frame of the child in the frame of the parent, at zero.
         axis: (3,) unit vector in the child's frame.
         limits: lowest and highest value, rad or mm; None if continuous or not in the file.
+        missing_limit: `lower` or `upper` if the file gives only the other limit, so that this one is 0.
         max_rate: fastest motion, rad/s or mm/s; None if not in the file.
         mimic: the relation to the joint that it follows; None if it does not follow one.
     """
@@ -73,6 +77,7 @@ class UrdfJoint:
     limits: tuple[float, float] | None
     max_rate: float | None
     mimic: Mimic | None
+    missing_limit: str = ""
 
     @property
     def moves(self) -> bool:
@@ -134,6 +139,8 @@ def parse_urdf(text: str, source: str) -> Urdf:
     try:
         root = ET.fromstring(text)
     except ET.ParseError as error:
+        if "<xacro:" in text:
+            raise RigError(source, "", _XACRO) from error
         raise RigError(source, f"line {error.position[0]}", f"not valid XML: {error}") from error
     return _Reader(source).robot(root)
 
@@ -150,9 +157,9 @@ class _Reader:
             raise self._fault("", f"it has {len(elements):,} elements; the maximum is {_MOST_ELEMENTS:,}")
         raw = next((e for e in elements if "xacro" in e.tag), None)
         if raw is not None:
-            raise self._fault(
-                f"<{_plain(raw.tag)}>", "xacro that is not expanded; run `xacro FILE > ROBOT.urdf`, and import that"
-            )
+            raise self._fault(f"<{_plain(raw.tag)}>", _XACRO)
+        if any(_EXPRESSION.search(value) for element in elements for value in element.attrib.values()):
+            raise self._fault("", _XACRO)
         for element in elements:  # a namespace of the whole document has no meaning here
             element.tag = _plain(element.tag)
         links = self._links(root)
@@ -214,12 +221,13 @@ class _Reader:
         limit = element.find("limit")
         scale = 1e3 if slides else 1.0
         limits = max_rate = None
+        missing: list[str] = []
         if limit is not None and kind != "continuous":
             low, high = (self._number(limit, key, where, 0.0) * scale for key in ("lower", "upper"))
             if low > high:
                 raise self._fault(where, f"its lower limit {low:g} is greater than its upper limit {high:g}")
-            stated = "lower" in limit.attrib or "upper" in limit.attrib
-            limits = (low, high) if stated else None
+            missing = [key for key in ("lower", "upper") if key not in limit.attrib]
+            limits = (low, high) if len(missing) < 2 else None
         if limit is not None and (rate := self._number(limit, "velocity", where, 0.0)) > 0.0:
             max_rate = rate * scale
         return UrdfJoint(
@@ -232,6 +240,7 @@ class _Reader:
             limits,
             max_rate,
             self._mimic(element, where, scale),
+            missing[0] if len(missing) == 1 else "",
         )
 
     def _mimic(self, element: ET.Element, where: str, scale: float) -> Mimic | None:

@@ -8,7 +8,8 @@ from typing import Any
 import click
 
 from daemon.cli.command import Command, json_option
-from daemon.cli.terminal import echo
+from daemon.cli.lines.fill_in import fill_in_lines, fill_in_note
+from daemon.cli.terminal import echo, echo_list
 from daemon.commands import INSTALLED_CONFIG
 
 
@@ -23,15 +24,19 @@ def config() -> None:
 def config_check(path: Path, *, as_json: bool) -> dict[str, Any]:
     """Check a configuration without opening any device.
 
-    Also checks its rig, and the DBC and EDS files that they name. PATH is /etc/rigcal/rigcal.toml by default.
+    Also checks its rig, and the DBC and EDS files that they name. Lines of the rig file that `rigcal init` marked FILL
+    IN are listed. PATH is /etc/rigcal/rigcal.toml by default.
     """
     from daemon.composition import decoders
     from daemon.config.config import read_config
-    from daemon.rig_files import load_rig
+    from daemon.rig_files import load_rig, read_rig_text
 
     settings = read_config(path)
     source = load_rig(settings.rig, named_in=path)
     links = decoders(settings, source)
+    text, name, _ = read_rig_text(settings.rig)
     if not as_json:
         echo(f"{path}: valid: rig {source.rig.name}, links {', '.join(links) or 'none'}")
-    return {"rig": source.rig.name, "links": list(links)}
+        if note := fill_in_note(text):
+            echo_list("Please note", [f"{name}: {note}"])
+    return {"rig": source.rig.name, "links": list(links), "fill_in": fill_in_lines(text)}

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from daemon.cli.command import Command, json_option
+from daemon.cli.lines.fill_in import fill_in_lines
 from daemon.cli.terminal import echo, echo_error
 from daemon.commands import CommandError
 from daemon.host.safe_output import write_file
@@ -275,7 +276,7 @@ def _check(path: Path) -> None:
 def _tell(out: Path, files: dict[str, str]) -> None:
     for name in files:
         echo(f"wrote {out / name}")
-    marked = sum(text.count("FILL IN") for text in files.values())
+    marked = sum(len(fill_in_lines(text)) for text in files.values())
     if marked:
         echo(f"fill in the values from the drawings at the {marked} places marked FILL IN")
     echo(f"then run `rigcal config check {out / CONFIG}` and `rigcal doctor --config {out / CONFIG}`")

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from daemon.cli.command import Command, json_option, out_file_option
+from daemon.cli.command import WRONG_INPUT, Command, json_option, out_file_option
+from daemon.cli.lines.fill_in import fill_in_lines, fill_in_note
 from daemon.cli.offline import FILE
 from daemon.cli.terminal import counted, echo, echo_error, echo_list, echo_table
 from daemon.commands import CommandError
@@ -38,12 +39,17 @@ def rig_check(path: str, svg: Path | None, *, as_json: bool) -> dict[str, Any]:
 
     FILE may also be the name of a shipped rig. All errors are reported with their lines. For a valid file the output
     has the positions of frames and prisms with all joints at zero, a drawing of the chain, the reach, the radii of
-    links that `rigcal plan` keeps clear of, and the parameters that fixes in poses all over the joint limits determine.
+    links that `rigcal plan` keeps clear of, the parameters that fixes in poses all over the joint limits determine, and
+    the lines that `rigcal init` marked FILL IN.
     """
     from calibration.design.rig_check import check_rig
     from calibration.rig.description import read_rig
     from daemon.rig_files import read_rig_text
 
+    if Path(path).suffix.lower() in (".csv", ".urdf", ".xacro", ".xml") and Path(path).is_file():
+        raise CommandError(
+            f"{path}: not a rig file (TOML); `rigcal rig import {path} --out RIG.toml` makes one from it", WRONG_INPUT
+        )
     text, name, _ = read_rig_text(path)
     rig, faults = read_rig(text, name)
     if rig is None:
@@ -51,7 +57,7 @@ def rig_check(path: str, svg: Path | None, *, as_json: bool) -> dict[str, Any]:
             echo_error(str(fault))
         raise faults[0]
     found = check_rig(rig)
-    result: dict[str, Any] = found.as_dict()
+    result: dict[str, Any] = found.as_dict() | {"fill_in": fill_in_lines(text)}
     if svg is not None:
         from daemon.report.chain_drawing import chain_svg
 
@@ -59,7 +65,7 @@ def rig_check(path: str, svg: Path | None, *, as_json: bool) -> dict[str, Any]:
         write_file(svg, chain_svg(poses, found.at, f"{rig.name}: {len(rig.rows)} rows, {len(rig.joints)} joints"))
         result["svg"] = str(svg)
     if not as_json:
-        _show(found)
+        _show(found, fill_in_note(text))
         if svg is not None:
             echo(f"Drawing: {svg}")
     return result
@@ -98,6 +104,8 @@ def rig_import(
     from calibration.rig.exchange.urdf import LONGEST, parse_urdf
     from drivers.files import read_text
 
+    if path.suffix.lower() == ".toml":
+        raise CommandError(f"{path}: already a rig file (TOML); `rigcal rig check {path}` checks it", WRONG_INPUT)
     if out.exists():
         raise CommandError(f"{out} exists and is not overwritten; name a different file, or remove it")
     is_table = path.suffix.lower() == ".csv"
@@ -161,7 +169,7 @@ def rig_export(path: str, out: Path, *, as_json: bool) -> dict[str, Any]:
     return {"rig": rig.name, "out": str(out)}
 
 
-def _show(found: RigCheck) -> None:
+def _show(found: RigCheck, fill_in: str) -> None:
     from daemon.cli.lines.sketch import sketch
     from daemon.report.drawing import forward_axis
 
@@ -193,4 +201,4 @@ def _show(found: RigCheck) -> None:
         f"limits, seen from a station {number(float((found.at.station_mm**2).sum() ** 0.5) / 1e3)} m away"
     )
     echo_list("Not determined", seen.unidentifiable)
-    echo_list("Please note", found.warnings)
+    echo_list("Please note", [*filter(None, [fill_in]), *found.warnings])

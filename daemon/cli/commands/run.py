@@ -6,6 +6,7 @@ import contextlib
 import logging
 import tempfile
 import threading
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -101,8 +102,7 @@ def run(
     set_up_logging(level=logging.DEBUG if verbose else logging.INFO)
     if not verbose:
         logging.getLogger("can").setLevel(logging.WARNING)  # python-can logs every socket that it creates
-    if bool(files) != is_replay or (sim and is_replay):
-        raise click.UsageError("give either --sim, or --replay FILE..., or neither")
+    _check_files(files, sim=sim, is_replay=is_replay)
     if config is not None:
         settings = read_config(config)
     elif sim:
@@ -145,6 +145,15 @@ def run(
     if not as_json:
         echo(f"the store is {settings.store_path}")
     return {"rig": source.rig.name, "mode": parts.mode, "store": str(settings.store_path)}
+
+
+def _check_files(files: Sequence[Path], *, sim: bool, is_replay: bool) -> None:
+    """Refuse files without --replay, and --replay without files or with --sim."""
+    if bool(files) == is_replay and not (sim and is_replay):
+        return
+    if files and not is_replay and files[0].suffix == ".toml":
+        raise click.UsageError(f"a configuration is given as an option: --config {files[0]}")
+    raise click.UsageError("give either --sim, or --replay FILE..., or neither")
 
 
 def _store(settings: Config, machine: str | None) -> Store:

@@ -95,7 +95,12 @@ def store_check(config: Path, backup: Path | None, *, as_json: bool) -> Delivere
         path, models = backup / backup_module.STORE, backup / backup_module.MODELS
     found = check_store(path, models)
     if not as_json:
-        echo(f"{path}: checked {found.captures} captures in {found.chunks} chunks, {found.models} live models")
+        parts = [
+            counted(found.captures, "capture"),
+            counted(found.chunks, "chunk"),
+            counted(found.models, "live model"),
+        ]
+        echo(f"{path}: checked {parts[0]} in {parts[1]}, {parts[2]}")
         for finding in found.findings:
             echo(f"  damaged: {finding}", fg="red")
         echo("restore the store from a backup: `rigcal store restore`" if found.findings else "no damage found")

@@ -68,8 +68,8 @@ def _gap(result: Mapping[str, Any]) -> str:
         return told
     before, after = number(held_out["rms_before_mm"]), number(held_out["rms_after_mm"])
     if not gap.get("effects"):
-        return f"{told} Held-out error {before} mm RMS."
-    return f"{told} Held-out error {before} mm RMS, with the effects {after} mm."
+        return f"{told} Held-out error of the calibrated kinematics: {before} mm RMS."
+    return f"{told} Held-out error: calibrated kinematics {before} mm RMS, with the effects {after} mm."
 
 
 def _residual(result: Mapping[str, Any]) -> str:

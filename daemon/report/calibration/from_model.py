@@ -50,6 +50,7 @@ def report_input(
     sources: Mapping[str, str] | None = None,
     setups: Sequence[SetupLine] = (),
     latencies: Mapping[str, Latency | str] | None = None,
+    stations: Mapping[str, str] | None = None,
     facts: Facts | None = None,
 ) -> ReportInput:
     """Gather the content of a calibration report.
@@ -61,6 +62,7 @@ def report_input(
         sources: label -> text: files or sessions of the data, and the model's hash.
         setups: station set-ups and control points, where known.
         latencies: session -> latency of its fixes, or why it is unknown; None for data without sessions.
+        stations: session -> name of the station that measured it, for the latencies.
         facts: the first lines of the report; derived from rows and model by default.
     """
     model = training.model
@@ -85,6 +87,7 @@ def report_input(
         provenance=provenance(model, made_utc_ns, sources or {}),
         setups=setups,
         latencies=latencies or {},
+        stations=stations or {},
         effects=list(_effects(training)),
         effects_reason=model.effects_reason,
         expected=judged.expected,

@@ -184,6 +184,7 @@ class ReportInput:
         ignored_columns: columns of the data that rigcal does not know (docs/reference/formats.md).
         setups: station set-ups with their control points, where known.
         latencies: session -> latency of its fixes relative to the joints, or why it is unknown; empty for files.
+        stations: session -> name of the station that measured it, for the latencies.
         provenance: label -> value: data hashes, versions, seed, time.
         expected: accuracy that the model expects of itself over the work volume, if known.
         axes: comparison of the model with single-joint sweeps of the judged rows.
@@ -210,6 +211,7 @@ class ReportInput:
     provenance: Mapping[str, str]
     setups: Sequence[SetupLine] = ()
     latencies: Mapping[str, Latency | str] = field(default_factory=dict)
+    stations: Mapping[str, str] = field(default_factory=dict)
     effects: Sequence[EffectLine] = ()
     effects_reason: str = "switched off"
     expected: ExpectedAccuracy | None = None

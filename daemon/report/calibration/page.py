@@ -49,7 +49,7 @@ def calibration_report(report: ReportInput) -> str:
             _parameters(report),
             _outliers(report),
             _setups(report),
-            timing(report.latencies),
+            timing(report.latencies, report.stations),
             markup.sources_section(report.provenance, _ignored(report)),
             signatures(),
         ]
@@ -361,9 +361,7 @@ def _parameters(report: ReportInput) -> str:
         content += [
             markup.paragraph(
                 f"The {min(len(lines), _PARAMETERS_SHOWN)} largest of {len(lines)} corrections. "
-                f"{unusual or 'None'} of all {'is' if unusual < 2 else 'are'} larger than {USUAL:g} build tolerances, "
-                f"as one in twenty is by chance; {beyond or 'none'} than {BEYOND_BUILDING:g}, which building does not "
-                "explain."
+                f"{_unusual_words(unusual, beyond)}"
             ),
             drawing.picture(
                 figures.corrections(report, _PARAMETERS_SHOWN),
@@ -373,6 +371,18 @@ def _parameters(report: ReportInput) -> str:
             markup.table(columns, rows, text_columns=(0, 5), classes=classes),
         ]
     return markup.section("What was corrected", *content)
+
+
+def _unusual_words(unusual: int, beyond: int) -> str:
+    if not unusual:
+        return f"None of them is larger than {USUAL:g} build tolerances."
+    words = (
+        f"{unusual} {'is' if unusual == 1 else 'are'} larger than {USUAL:g} build tolerances; by chance, one in 20 is."
+    )
+    if not beyond:
+        return f"{words} None is larger than {BEYOND_BUILDING:g}."
+    verb = "is" if beyond == 1 else "are"
+    return f"{words} {beyond} {verb} larger than {BEYOND_BUILDING:g}, which building errors do not explain."
 
 
 def _identifiability_words(report: ReportInput) -> str:
@@ -397,7 +407,7 @@ def _outliers(report: ReportInput) -> str:
         "and had little or no weight in the fit. They still count in every figure of this report."
     )
     rows = [[o.row, o.prism, number(o.error_mm), number(o.sigmas, 2)] for o in worst]
-    columns = ["row of the data", "prism", "error, mm", "in standard deviations"]
+    columns = ["fix", "prism", "error, mm", "in standard deviations"]
     caption = f"The {len(worst)} worst" if len(worst) < len(report.outliers) else ""
     return markup.section(
         "Fixes set aside", markup.paragraph(words), markup.table(columns, rows, text_columns=(0, 1), caption=caption)

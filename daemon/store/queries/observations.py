@@ -54,6 +54,9 @@ _FIRST_CONSTANTS = """SELECT fixes.station, fixes.prism_constant_mm, min(first.i
     FROM (SELECT id, fix_id FROM observations WHERE session_id = ? AND excluded IS NULL
         ORDER BY boot_id, monotonic_ns LIMIT 10000) AS first CROSS JOIN fixes ON fixes.id = first.fix_id
     WHERE prism_constant_mm IS NOT NULL GROUP BY station"""
+# The stations of a session's observations
+_STATIONS = """SELECT DISTINCT fixes.station FROM observations CROSS JOIN fixes ON fixes.id = fix_id
+    WHERE session_id = ? ORDER BY fixes.station"""
 # A session's observations: all of them by the index, or with NOT INDEXED the newest by their numbers.
 TOTALS = """SELECT max(id) AS last, count(*) FILTER (WHERE excluded IS NULL) AS used, min(boot_id) AS first_boot,
         max(boot_id) AS last_boot, min(utc_ns - monotonic_ns) AS least_ns, max(utc_ns - monotonic_ns) AS most_ns
@@ -193,6 +196,11 @@ def observations(source: RowSource, session_ids: Sequence[str]) -> list[dict[str
 def moving_observations(source: RowSource, session_ids: Sequence[str]) -> list[dict[str, Any]]:
     """Return the observations of sessions that were measured while the boom moved and have no other fault."""
     return list(source.rows(_MOVING.format(marks(session_ids)), session_ids))
+
+
+def stations_of(source: RowSource, session_id: str) -> list[str]:
+    """Return the names of the stations that measured a session."""
+    return [row["station"] for row in source.rows(_STATIONS, (session_id,))]
 
 
 def all_observations(source: RowSource, session_ids: Sequence[str] = ()) -> list[dict[str, Any]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from importlib.resources import files
@@ -21,7 +22,7 @@ from calibration.effects.library import library
 from calibration.errors import DataError
 from calibration.gap.adoption import Adopted
 from calibration.gap.candidates import candidate_at, candidate_effects
-from calibration.gap.criteria import with_same_family
+from calibration.gap.criteria import better_text, with_same_family
 from calibration.gap.discrimination import POSES, propose_experiments
 from calibration.gap.forecast import forecasts
 from calibration.gap.projected.projection import Projection, from_products
@@ -425,3 +426,11 @@ def test_an_effect_of_the_forecast_size_stands_out_and_one_of_half_the_size_does
         residuals = share * size * columns[:, 0] + noise
         mean = np.mean([from_products(columns.T @ columns, columns.T @ residual, sigma) for residual in residuals])
         assert mean == pytest.approx(needed, rel=0.1) if above else mean < 0.5 * needed
+
+
+@pytest.mark.parametrize(
+    ("log_odds", "words"),
+    [(0.0, "1 times"), (math.log(400.0), "400 times"), (12.0, "e^12 times"), (3083.0, "overwhelmingly")],
+)
+def test_odds_without_meaning_are_a_word(log_odds: float, words: str) -> None:
+    assert better_text("backlash@q1", log_odds) == f"backlash@q1 explains the data {words} better"

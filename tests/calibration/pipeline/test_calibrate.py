@@ -214,7 +214,7 @@ def _measured(truth: RigTruth, observations: Observations) -> np.ndarray:
     [
         (
             lambda o: o.select(np.arange(15)),
-            "15 different fixes have 45 coordinates, which cannot determine 56 parameters; measure 112 or more",
+            "15 fixes have 45 coordinates, which cannot determine 56 parameters; measure 112 or more",
         ),
         (lambda o: replace(o, position_mm=o.position_mm / 1000.0), "the positions are in m"),
         (lambda o: replace(o, position_mm=o.position_mm[:, [1, 0, 2]]), "mirrored"),
@@ -236,9 +236,7 @@ def test_data_that_would_give_a_wrong_model_are_refused(session: Session, change
 
 def test_repeats_do_not_count_as_poses(session: Session) -> None:
     repeated = joined(*[session.training.select(np.arange(10))] * 4)
-    with pytest.raises(
-        UnsafeError, match=r"10 different fixes, repeats counted once of 40, .*\(fewer than 19 are refused\)"
-    ):
+    with pytest.raises(UnsafeError, match=r"10 different poses among 40 fixes .*\(fewer than 19 are refused\)"):
         identify(session.rig, TEXT, repeated)
 
 

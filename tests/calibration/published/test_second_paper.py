@@ -124,7 +124,7 @@ def test_km_takes_any_rig_and_several_set_ups(session) -> None:
 
 def test_too_few_fixes_and_mirrored_coordinates_are_refused_in_a_sentence() -> None:
     rig, training, _ = robot(5, ())
-    with pytest.raises(UnsafeError, match=r"9 different fixes cannot determine 27 parameters.*at least 10"):
+    with pytest.raises(UnsafeError, match=r"9 different poses cannot determine 27 parameters.*at least 10"):
         km(rig, training.select(np.arange(9)), Run())
     with pytest.raises(UnsafeError, match="mirrored"):
         km(rig, replace(training, position_mm=training.position_mm * [1.0, -1.0, 1.0]), Run())

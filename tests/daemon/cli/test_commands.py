@@ -116,3 +116,17 @@ def test_the_state_of_a_running_daemon_is_shown_with_nothing_heavy_loaded(tmp_pa
     with idle_daemon(tmp_path) as config:
         for command in (["status", "--frames"], ["alarms"], ["session", "list"]):
             assert heavy_modules(*command, "--socket", str(config.socket_path)) == []
+
+
+def test_a_configuration_given_as_a_file_is_answered_with_the_option(tmp_path: Path) -> None:
+    config = tmp_path / "rigcal.toml"
+    config.touch()
+    told = CliRunner().invoke(main, ["run", str(config)])
+    assert told.exit_code == 2
+    assert f"--config {config}" in told.stderr
+
+
+def test_an_option_without_its_value_is_answered_with_what_to_give() -> None:
+    told = CliRunner().invoke(main, ["session", "guide", "--stop"])
+    assert told.exit_code == 2
+    assert "Option --stop needs a value: --stop REASON" in told.stderr

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import pytest
 from click.testing import CliRunner, Result
 
-from daemon.cli.diagnosis import can_interface, daemon_state
+from daemon.cli.diagnosis import Finding, can_interface, daemon_state
 from daemon.cli.main import main
 from daemon.config.sections import CanSection
 from tests.daemon.support.idle_daemon import idle_daemon
@@ -140,20 +141,71 @@ def test_a_running_daemon_tells_of_store_and_channels(tmp_path: Path) -> None:
     assert "theta1" in findings["joints"]["text"]
 
 
-def test_a_channel_that_falls_silent_again_and_again_may_have_too_short_a_time_out() -> None:
+def told(*, alarms: Sequence[Mapping[str, str]] = (), **acquisition: Any) -> list[Finding]:
+    """What doctor finds of a daemon with this status."""
     status = {
         "version": "0.1.0",
         "mode": "live",
         "store": "/x",
         "store_health": {"state": "ok", "text": ""},
-        "alarms": {"active": []},
-        "acquisition": {
-            "links": [],
-            "channels": [],
-            "stations": [],
-            "gap_counts": [{"channel": "theta1", "reason": "silent", "count": 40, "missed": 0}],
-        },
+        "alarms": {"active": alarms},
+        "acquisition": {"links": [], "channels": [], "stations": [], "gap_counts": [], **acquisition},
     }
-    findings = {finding.subject: finding for finding in daemon_state(status, "0.2.0")}
-    assert "timeout_s" in findings["timeout of theta1"].remedy
-    assert findings["daemon"].remedy == "`systemctl restart rigcal`"
+    return list(daemon_state(status, "0.2.0"))
+
+
+def silences(channels: int, reason: str = "silent") -> list[dict[str, Any]]:
+    return [{"channel": f"theta{n}", "reason": reason, "count": 40 - n, "missed": 0} for n in range(1, channels + 1)]
+
+
+def only(findings: Sequence[Finding], subject: str) -> Finding:
+    (found,) = (finding for finding in findings if finding.subject == subject)
+    return found
+
+
+@pytest.fixture
+def idle(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "getloadavg", lambda: (0.0, 0.0, 0.0))
+
+
+@pytest.mark.usefixtures("idle")
+def test_channels_that_fall_silent_again_and_again_are_one_finding() -> None:
+    findings = told(gap_counts=silences(17))
+    found = only(findings, "timeouts")
+    assert found.text.endswith(
+        "theta1 39 times, theta2 38 times, theta3 37 times, theta4 36 times, theta5 35 times, and 12 more"
+    )
+    assert found.remedy.startswith("check their cables; if a device is only slow")
+    assert "timeout_s" in found.remedy
+    assert only(findings, "daemon").remedy == "`systemctl restart rigcal`"
+    assert only(told(), "timeouts").state == "good"
+
+
+@pytest.mark.usefixtures("idle")
+def test_captures_that_were_read_late_name_the_processor_before_the_rig_file() -> None:
+    found = only(told(gap_counts=silences(2) + silences(1, "time_doubtful")), "timeouts")
+    assert found.remedy.startswith("an overloaded processor is the likely cause: relieve it")
+
+
+def test_a_busy_processor_is_named_before_the_rig_file(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "getloadavg", lambda: (1e3, 0.0, 0.0))
+    assert only(told(gap_counts=silences(1)), "timeouts").remedy.startswith("an overloaded processor")
+
+
+@pytest.mark.parametrize(
+    ("status", "remedy"),
+    [("link_down", "the plug, the cable"), ("silent", "power and cable"), ("not_locked", "aim it at the prism")],
+)
+def test_the_remedy_for_a_station_follows_its_state(status: str, remedy: str) -> None:
+    station = {"name": "station", "age_s": 12.0, "status": status, "sentence": status}
+    found = only(told(stations=[station]), "station station")
+    assert (found.state, remedy in found.remedy) == ("warning", True)
+    assert ("aim" in found.remedy) == (status == "not_locked")
+
+
+def test_alarms_that_only_warn_are_no_fault() -> None:
+    critical = {"kind": "link_down", "subject": "boom", "severity": "critical"}
+    warning = {"kind": "disk_low", "subject": "disk", "severity": "warning"}
+    shown = [(f.state, f.text) for f in told(alarms=[critical, warning]) if f.subject == "alarms"]
+    assert shown == [("fault", "link_down boom"), ("warning", "disk_low disk")]
+    assert [f.state for f in told(alarms=[warning]) if f.subject == "alarms"] == ["warning"]

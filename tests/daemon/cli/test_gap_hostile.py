@@ -75,7 +75,7 @@ OTHER_RIG = {"prism": ["tmac"], "q1_deg": ["1"], "x_mm": ["1"], "y_mm": ["1"], "
     ("data", "holdout", "expected", "words"),
     [
         (rows(table(5), 0), None, 2, "data.csv: no observations below the header"),
-        (rows(table(5), 3), None, 3, "3 different fixes have 9 coordinates, which cannot determine 56 parameters"),
+        (rows(table(5), 3), None, 3, "3 fixes have 9 coordinates, which cannot determine 56 parameters"),
         ({name: cells * 20 for name, cells in rows(table(5), 1).items()}, None, 3, "cannot place the base"),
         (table(20), OTHER_RIG, 2, "holdout.csv, line 1, column theta1_deg: column missing for rig 'swdt82'"),
         (table(20), rows(table(5), 0), 2, "holdout.csv: no observations below the header"),

@@ -34,13 +34,32 @@ def test_the_files_pass_the_check_and_are_never_overwritten(tmp_path: Path) -> N
     assert made.exit_code == 0, made.output
     assert "FILL IN" in made.stdout
     checked = CliRunner().invoke(main, ["config", "check", str(tmp_path / "rigcal.toml"), "--json"])
-    assert json.loads(checked.stdout) == {"rig": "my_rig", "links": ["boom", "station"]}
+    told = json.loads(checked.stdout)
+    assert (told["rig"], told["links"]) == ("my_rig", ["boom", "station"])
     before = {path: path.read_bytes() for path in tmp_path.iterdir()}
     again = init("--out", str(tmp_path))
     assert again.exit_code == 2
     assert "is not overwritten" in again.stderr
     assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
     assert b"allow_transmit = true" not in [line for file in before.values() for line in file.splitlines()]
+
+
+def test_checks_list_the_lines_that_are_still_to_be_filled_in(tmp_path: Path) -> None:
+    made = init("--out", str(tmp_path), "--joint", "theta1:revolute:-15:60:32", "--prism", "tip", "--station", "none")
+    rig = next(path for path in tmp_path.iterdir() if path.name != "rigcal.toml")
+    lines = rig.read_text(encoding="utf-8").splitlines()
+    marked = [n for n, line in enumerate(lines, 1) if "FILL IN" in line and not line.startswith("#")]
+    assert len(marked) == 3
+    assert "at the 3 places marked FILL IN" in made.stdout
+    note = f"lines {', '.join(map(str, marked))}: still to be filled in from the drawings"
+    for command in (["config", "check", str(tmp_path / "rigcal.toml")], ["rig", "check", str(rig)]):
+        checked = CliRunner().invoke(main, command)
+        assert checked.exit_code == 0
+        assert note in " ".join(checked.stdout.split())
+        assert json.loads(CliRunner().invoke(main, [*command, "--json"]).stdout)["fill_in"] == marked
+    rig.write_text("\n".join(lines).replace("FILL IN", "from the drawings"), encoding="utf-8")
+    checked = CliRunner().invoke(main, ["config", "check", str(tmp_path / "rigcal.toml")])
+    assert "filled in" not in checked.stdout
 
 
 def test_a_shipped_rig_needs_no_rig_file(tmp_path: Path) -> None:

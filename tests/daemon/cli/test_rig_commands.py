@@ -49,6 +49,18 @@ def test_check_shows_places_reach_radii_and_what_data_can_show(tmp_path: Path) -
     assert (tmp_path / "ur10.svg").read_text(encoding="utf-8").count("<path") > 20
 
 
+def test_check_and_import_name_each_other_for_a_file_of_the_other_kind(tmp_path: Path) -> None:
+    table, rig = tmp_path / "table.csv", tmp_path / "arm.toml"
+    table.write_text("joint,a_mm\nq1,100\n", encoding="utf-8")
+    rig.write_text("", encoding="utf-8")
+    told = run("rig", "check", table)
+    assert told.exit_code == 2
+    assert f"`rigcal rig import {table} --out RIG.toml` makes one from it" in " ".join(told.stderr.split())
+    told = run("rig", "import", rig, "--out", tmp_path / "new.toml")
+    assert told.exit_code == 2
+    assert f"`rigcal rig check {rig}` checks it" in " ".join(told.stderr.split())
+
+
 def test_check_draws_the_chain_for_people() -> None:
     shown = run("rig", "check", "swdt82").stdout
     assert "swdt82: valid: 9 rows, 9 joints, 4 prisms" in shown

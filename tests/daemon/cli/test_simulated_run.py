@@ -52,7 +52,11 @@ def test_a_simulated_rig_leaves_a_configuration_for_commands_on_its_store(rig: s
     config = tmp_path / "rigcal-sim" / "rigcal.toml"
     with running(tmp_path, rig):
         assert answer_apart("status", "--config", str(config))["mode"] == "simulated"
-    assert answer_apart("config", "check", str(config)) == {"rig": rig, "links": ["boom", "station"]}
+    assert answer_apart("config", "check", str(config)) == {
+        "rig": rig,
+        "links": ["boom", "station"],
+        "fill_in": [],
+    }
     assert answer_apart("store", "check", "--config", str(config))
 
 

@@ -44,6 +44,7 @@ def test_a_store_is_told_checked_backed_up_damaged_and_restored(config: Path) ->
     assert (found["chunks"], found["small_chunks"], found["undecoded_chunks"]) == (1, 1, 0)
     assert found["tables"]["raw_chunks"] >= 4096
     assert told(config, "check")["is_sound"]
+    assert "checked 10 captures in 1 chunk, 0 live models" in say(config, "check").stdout
     backup = told(config, "backup")["backup"]
     assert [b["path"] for b in told(config, "backup", "--list")["backups"]] == [backup]
     assert "no damage found" in say(config, "check", "--backup", backup).stdout

@@ -43,6 +43,10 @@ def test_a_report_tells_the_latency_of_each_session(rig: JobRig, tmp_path: Path)
     moving = {name: np.asarray(values)[is_moving] for name, values in runs.columns.items()}
     path = SimulatedObservations(moving, runs.measured_mm[is_moving], runs.oracle_mm[is_moving])
     rig.observed("a", path, moving=True)
+    (wrong,) = rig.store.rows(
+        "SELECT id, pose FROM observations WHERE session_id = 'a' AND NOT moving LIMIT 1 OFFSET 9"
+    )
+    rig.store.update("observations", {"id": wrong["id"]}, {"x_mm": 0.0})
     with Reader(rig.store.path) as reader:
         poses = parse_observations(sessions_csv(reader, SOURCE.rig, ("a",)), SOURCE.rig, "poses")
     model = identify(SOURCE.rig, SOURCE.text, poses, effects="none")
@@ -63,7 +67,8 @@ def test_a_report_tells_the_latency_of_each_session(rig: JobRig, tmp_path: Path)
     latency = result["latency"]
     page = Path(result["report"]).read_text(encoding="utf-8")
     assert "Timing of station and bus" in page
-    assert f"In a the station is late by {latency['a']['seconds'] * 1e3:.0f} ms" in page
+    assert f"the station is late: add {latency['a']['seconds'] * 1e3:.0f} ms to link_delay_s" in page
+    assert f">pose {wrong['pose']} of session a</td>" in page, "an outlier is named by its pose: there is no file"
     assert f"c: not known, {latency['c']['reason']}." in page
     assert abs(latency["a"]["seconds"] - LATE_S) < 4.0 * latency["a"]["standard_error_s"]
     assert latency["a"]["standard_error_s"] < 0.03

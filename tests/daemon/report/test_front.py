@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -50,6 +51,14 @@ def test_the_first_lines_say_what_the_report_is_of(pages: dict[str, str], name: 
     assert head.count("Ada") == 1
     assert 'class="verdict passed"' in head
     assert page.index("Checked by") > page.index("Where this comes from")
+
+
+def test_reports_of_a_simulated_rig_say_so_in_their_head() -> None:
+    facts = replace(FACTS, is_simulated=True)
+    for page in (calibration_report(report_input(n=4, facts=facts)), gap_report(gap_support.named(), {}, facts)):
+        head = page[page.index("<h1>") : page.index('class="headline"')]
+        assert re.findall(r'<th scope="row">([^<]*)</th>', head) == [LABELS[0], "Simulated", *LABELS[1:]]
+        assert "measured on a simulated rig, in simulated time" in head
 
 
 def test_what_nobody_has_said_is_not_given_and_no_tolerance_is_assumed() -> None:

@@ -7,8 +7,10 @@ from typing import Any
 from daemon.sessions.session_data import sessions_measured
 from daemon.sessions.without_job import why_no_job
 from daemon.store.queries.jobs import JobTable
+from daemon.store.queries.observations import stations_of
 from daemon.store.queries.sessions import SessionTable
 from daemon.store.reader import Reader
+from drivers.clock import SIMULATED_BOOT, Stamp
 from tests.daemon.support.jobs import JobRig
 
 
@@ -58,3 +60,26 @@ def test_a_report_names_who_measured_what_and_when(rig: JobRig) -> None:
     assert (measured.instruments, measured.setups) == (("simulated",), ("S1",))
     assert measured.measured_utc_ns is not None
     assert measured.measured_utc_ns[0] < measured.measured_utc_ns[1]
+    assert not measured.is_simulated
+
+
+def test_sessions_of_a_simulated_rig_are_known_by_the_boot_of_their_clock(rig: JobRig) -> None:
+    rig.session("a")
+    simulated = rig.clock.now()
+    simulated = Stamp(simulated.utc_ns, simulated.monotonic_ns, f"{SIMULATED_BOOT}1")
+    rig.store.update("calibration_sessions", {"id": "a"}, rig.store.instant(simulated, "started_"))
+    with Reader(rig.config.store_path) as reader:
+        assert sessions_measured(reader, ("a",)).is_simulated
+
+
+def test_the_stations_of_a_session_are_those_of_its_fixes(rig: JobRig) -> None:
+    rig.measured("a", 4)
+    with Reader(rig.config.store_path) as reader:
+        assert stations_of(reader, "a") == []
+    now = rig.clock.now()
+    instants = rig.store.instant(now) | rig.store.instant(now, "last_byte_")
+    fix = {"station": "north", "status": "ok", "lock": "locked", "reason": "", "raw": b"", **instants}
+    rig.store.insert("fixes", {"id": 1, **fix})
+    rig.store.update("observations", {"session_id": "a"}, {"fix_id": 1})
+    with Reader(rig.config.store_path) as reader:
+        assert stations_of(reader, "a") == ["north"]

@@ -46,10 +46,30 @@ def test_a_rigs_table_is_the_same_rig_again(name: str) -> None:
 
 
 def test_an_import_tells_whose_limits_it_assumes() -> None:
-    draft = draft_of_table("joint,a_mm,lower,upper\nq1,100,-90,90\nq2,100,,\n", "x.csv")
+    text = "joint,alpha_deg,a_mm,d_mm,theta_deg,lower,upper\nq1,0,100,0,0,-90,90\nq2,0,100,0,0,,\n"
+    draft = draft_of_table(text, "x.csv")
     assert draft.notes[-1] == (
         "Assumed: the random errors of readings (sigma), the limits of q2, the build tolerances and the station."
     )
+
+
+@pytest.mark.parametrize(
+    ("header", "assumed"),
+    [
+        ("joint,d_mm,theta_deg", "alpha_deg = 0 and a_mm = 0 for all rows: the table has no such columns"),
+        ("joint,a_m,theta_rad", "alpha_deg = 0 and d_mm = 0 for all rows: the table has no such columns"),
+        ("joint,d_mm,lower", "alpha_deg = 0, a_mm = 0 and theta_deg = 0 for all rows: the table has no such columns"),
+    ],
+)
+def test_an_import_tells_which_constants_it_takes_as_zero(header: str, assumed: str) -> None:
+    draft = draft_of_table(f"{header}\nq1,100,5\n", "x.csv")
+    assert draft.notes[-1].endswith(f"the station; {assumed}.")
+    assert assumed in draft.text()
+
+
+def test_one_missing_column_is_named_in_the_singular() -> None:
+    draft = draft_of_table("joint,alpha_deg,d_mm,theta_deg\nq1,0,100,0\n", "x.csv")
+    assert draft.notes[-1].endswith("; a_mm = 0 for all rows: the table has no such column.")
 
 
 def test_a_row_may_be_driven_by_a_sum() -> None:

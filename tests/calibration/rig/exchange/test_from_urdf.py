@@ -117,6 +117,9 @@ JOINT = '<joint name="j" type="{}"><parent link="a"/><child link="b"/>{}</joint>
         ("<sdf/>", "not <robot>"),
         ('<!DOCTYPE r [<!ENTITY x "y">]><robot/>', "document type"),
         ('<robot xmlns:xacro="http://www.ros.org/wiki/xacro"><xacro:macro name="m"/></robot>', "run `xacro FILE"),
+        ('<robot><xacro:macro name="m"/></robot>', "run `xacro FILE"),
+        ('<robot><link name="${prefix}base"/></robot>', "run `xacro FILE"),
+        ('<robot name="$(arg name)"><link name="base"/></robot>', "run `xacro FILE"),
         ("<robot>" + LINKS + "</robot>", "2 links are not the child of a joint"),
         ("<robot>" + LINKS + JOINT.format("spherical", "") + "</robot>", "unknown type of joint 'spherical'"),
         ("<robot>" + LINKS + JOINT.format("revolute", '<axis xyz="0 0 0"/>') + "</robot>", "its axis is zero"),
@@ -184,6 +187,23 @@ def test_a_joint_without_limits_gets_some_and_the_file_says_so() -> None:
     assert draft.rig().joints[0].limits == (-180.0, 180.0)
     assert "limits assumed" in draft.text()
     assert "the limits of j," in draft.notes[0]
+
+
+@pytest.mark.parametrize(
+    ("limit", "limits", "note"),
+    [
+        ('upper="1.5707963267948966"', (0.0, 90.0), "the lower limit 0 of j: the URDF gives only the upper one"),
+        ('lower="-1.5707963267948966"', (-90.0, 0.0), "the upper limit 0 of j: the URDF gives only the lower one"),
+    ],
+)
+def test_a_limit_that_the_urdf_lacks_is_zero_and_the_import_says_so(
+    limit: str, limits: tuple[float, float], note: str
+) -> None:
+    text = "<robot>" + LINKS + JOINT.format("revolute", f'<axis xyz="0 0 1"/><limit {limit}/>') + "</robot>"
+    draft = draft_of_urdf(parse_urdf(text, "turn.urdf"), "turn.urdf")
+    assert draft.rig().joints[0].limits == pytest.approx(limits)
+    assert draft.notes[0].endswith(f"the station; {note}.")
+    assert "limit assumed" in draft.text()
 
 
 def test_a_document_that_yourdfpy_reads_too() -> None:

@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 from click.testing import CliRunner
 
-from daemon.cli.lines.jobs import job_line, percent
+from daemon.cli.lines.jobs import job_line, outcome, percent
 from daemon.cli.lines.summary import LINES, state_sentence, summary
 from daemon.cli.main import main
 from daemon.next_step import next_line
@@ -274,3 +274,12 @@ def test_watch_refreshes_a_terminal_and_leaves_it_as_it_was(tmp_path: Path) -> N
     assert said.endswith(b"\x1b[?25h\x1b[?1049l")
     assert said.count(b"\x1b[H") == 2
     assert b"joints" in said
+
+
+def test_the_result_of_a_gap_job_says_which_stage_its_errors_are_of() -> None:
+    found = {"effects": ["backlash@theta4"], "holdout": {"rms_before_mm": 22.6, "rms_after_mm": 3.1}}
+    job = {"kind": "gap", "state": "done", "error": None, "result": {"sentence": "It lacked play.", "gap": found}}
+    told = "It lacked play. Held-out error: calibrated kinematics 22.6 mm RMS, with the effects 3.10 mm."
+    assert outcome(job) == told
+    job["result"] = {"sentence": "Nothing lacked.", "gap": found | {"effects": []}}
+    assert outcome(job) == "Nothing lacked. Held-out error of the calibrated kinematics: 22.6 mm RMS."

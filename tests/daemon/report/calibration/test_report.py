@@ -7,7 +7,7 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from daemon.report.calibration.inputs import EffectLine, ErrorTable, spread
+from daemon.report.calibration.inputs import EffectLine, ErrorTable, ParameterLine, spread
 from daemon.report.calibration.page import calibration_report, headline
 from daemon.report.words import number, signed
 from tests.daemon.support.report_inputs import report_input
@@ -70,6 +70,22 @@ def test_report_has_every_section(outline: Outline) -> None:
         "Station set-ups",
         "Where this comes from",
     ]
+
+
+@pytest.mark.parametrize(
+    ("corrections", "words"),
+    [
+        ([1.0, 0.5], "None of them is larger than 2 build tolerances."),
+        ([3.0, 0.5], "1 is larger than 2 build tolerances; by chance, one in 20 is. None is larger than 4."),
+        (
+            [9.0, 3.0],
+            "2 are larger than 2 build tolerances; by chance, one in 20 is. 1 is larger than 4, which building",
+        ),
+    ],
+)
+def test_the_number_of_large_corrections_is_a_plain_sentence(corrections: list[float], words: str) -> None:
+    lines = [ParameterLine(f"row{n}.a", "mm", size, 0.1, 1.0, True) for n, size in enumerate(corrections, 1)]
+    assert words in calibration_report(report_input(n=4, parameters=lines))
 
 
 def test_named_effects_have_a_section_with_their_sizes() -> None:
