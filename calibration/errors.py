@@ -1,4 +1,7 @@
-"""The few errors of `calibration`. The command line turns them into exit statuses 1, 2 and 3."""
+"""The few errors of `calibration`. The command line turns them into exit statuses 1, 2 and 3.
+
+An argument of a wrong type is a TypeError, which only programs can cause.
+"""
 
 from __future__ import annotations
 
@@ -52,3 +55,26 @@ class ModelError(CalibrationError):
 
 class UnsafeError(CalibrationError):
     """The result would be unsafe to use: not identifiable, worse than the live model, or from another rig's data."""
+
+
+def check_type(name: str, value: object, kind: type | tuple[type, ...], wanted: str) -> None:
+    """Check the type of an argument that a user gives.
+
+    Args:
+        name: name of the argument.
+        value: its value.
+        kind: the type that it must have, or several.
+        wanted: what to give instead, and how to get it.
+
+    Raises:
+        TypeError: the value has a different type.
+    """
+    if not isinstance(value, kind):
+        raise wrong_type(name, value, wanted)
+
+
+def wrong_type(name: str, value: object, wanted: str) -> TypeError:
+    """Return the error about an argument of a wrong type; the arguments are those of `check_type`."""
+    found = type(value).__name__
+    article = "an" if found[0] in "AEIOaeio" else "a"
+    return TypeError(f"{name} is {'None' if value is None else f'{article} {found}'}; give {wanted}")

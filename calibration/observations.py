@@ -6,6 +6,7 @@ import csv
 import hashlib
 import io
 import math
+import os
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -13,10 +14,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.errors import DataError
+from calibration.errors import DataError, check_type, wrong_type
 from calibration.rig.columns import LEAST_SIGMA_MM
-from calibration.rig.description import Rig
+from calibration.rig.description import Rig, check_rig
 from calibration.rig.limits import on_one_turn
+from calibration.rig.words import counted
 from calibration.table import (
     LABEL_COLUMNS,
     POSITION_COLUMNS,
@@ -104,7 +106,11 @@ class Observations:
 
         Raises:
             DataError: the file is malformed or does not fit the rig; names file, line, column and reason.
+            TypeError: an argument has a wrong type.
         """
+        check_rig(rig)
+        frames = "rigcal.Observations.from_frame reads a data frame"
+        check_type("path_or_text", path_or_text, (str, os.PathLike), f"the path of a CSV file, or its text; {frames}")
         if isinstance(path_or_text, str) and "\n" in path_or_text:
             return parse_observations(path_or_text.encode(), rig, "text", positions_required=positions_required)
         path = Path(path_or_text)
@@ -125,13 +131,24 @@ class Observations:
 
         Raises:
             DataError: the frame is malformed or does not fit the rig; names row (from 0), column and reason.
+            TypeError: an argument has a wrong type.
         """
+        check_rig(rig)
+        if not hasattr(frame, "columns"):
+            files = "rigcal.Observations.from_csv reads a file"
+            raise wrong_type("frame", frame, f"a data frame of pandas or polars, as pd.DataFrame(columns); {files}")
         return _build(
             read_frame(frame, rig, "data frame", positions_required=positions_required), rig, positions_required
         )
 
     def __len__(self) -> int:
         return len(self.prism)
+
+    def __repr__(self) -> str:
+        poses = {pose for pose in zip(self.session, self.setup, self.pose, strict=True) if pose[-1]}
+        counts = ((len(poses), "pose"), (len({name for name in self.session if name}), "session"))
+        more = "".join(f", {counted(count, noun)}" for count, noun in counts if count)
+        return f"Observations({counted(len(self), 'fix', 'fixes')} of {counted(len(set(self.prism)), 'prism')}{more})"
 
     def select(self, rows: NDArray[np.bool_] | NDArray[np.intp]) -> Observations:
         """Return the given rows, by mask or by index."""
@@ -191,6 +208,20 @@ class Observations:
         """Return (n,) workspace cells: coordinates divided by `size_mm` and rounded, halves to even."""
         index = np.rint(self.position_mm / size_mm).astype(int)
         return np.array([f"{x},{y},{z}" for x, y, z in index], dtype=np.str_)
+
+
+def check_observations(name: str, value: object) -> None:
+    """Check that an argument is Observations, and not a data frame or a path.
+
+    Args:
+        name: name of the argument.
+        value: its value.
+
+    Raises:
+        TypeError: it is not.
+    """
+    made = "rigcal.Observations.from_csv('fixes.csv', rig) or rigcal.Observations.from_frame(frame, rig)"
+    check_type(name, value, Observations, f"Observations, as from {made}")
 
 
 def cell_mm(position_mm: Floats, setup: Strings | NDArray[np.intp]) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Collection, Sequence
+from numbers import Integral
 from pathlib import Path
 from typing import get_args
 
@@ -12,6 +13,7 @@ import numpy as np
 from calibration.design.planning import PosePlan, plan_poses
 from calibration.effects.fitted import FittedEffect
 from calibration.effects.library import library
+from calibration.errors import check_type, wrong_type
 from calibration.evaluation.evaluation import Evaluation, evaluate
 from calibration.export.formats import export_files
 from calibration.export.model_export import Export
@@ -22,11 +24,11 @@ from calibration.model.inverse import Inverse, inverse
 from calibration.model.model import CalibratedModel, ParameterEstimate
 from calibration.model.prediction import Prediction, Predictor
 from calibration.model.warnings import model_warnings
-from calibration.observations import Observations
+from calibration.observations import Observations, check_observations
 from calibration.pipeline.calibrate import calibrate as calibrate_rig
 from calibration.pipeline.find_gap import find_gap as find_gap_of_rig
 from calibration.residual.selection import Kind
-from calibration.rig.description import Rig
+from calibration.rig.description import Rig, check_rig
 from calibration.run_settings import Progress, Run
 from daemon.host.safe_output import write_file
 from daemon.models.model_files import read_model, write_model
@@ -38,10 +40,15 @@ class Model:
     `calibrate` makes one, `load` reads one.
 
     Args:
-        data: the parts of the model, as `calibration.model.model` documents them.
+        data: the parts of the model, as `calibration.model.model` documents them, such as `GapResult.model`.
+
+    Raises:
+        TypeError: `data` has a different type, such as the path of a model.
     """
 
     def __init__(self, data: CalibratedModel) -> None:
+        wanted = "the model of a GapResult; rigcal.Model.load('model') reads a directory"
+        check_type("data", data, CalibratedModel, wanted)
         self.data = data
 
     def __repr__(self) -> str:
@@ -121,7 +128,9 @@ class Model:
         Raises:
             UnsafeError: the model does not know a set-up.
             CalibrationError: a position is not a finite number.
+            TypeError: `observations` has a wrong type.
         """
+        check_observations("observations", observations)
         return Predictor.of(self.data).predict(observations)
 
     def warnings_for(self, observations: Observations) -> tuple[str, ...]:
@@ -129,7 +138,11 @@ class Model:
 
         Args:
             observations: n rows; positions are not needed.
+
+        Raises:
+            TypeError: `observations` has a wrong type.
         """
+        check_observations("observations", observations)
         return model_warnings(self.data, observations)
 
     def inverse(self, targets: Observations) -> Inverse:
@@ -146,7 +159,9 @@ class Model:
         Raises:
             DataError: a row without a position, or rows of one pose with different commands.
             UnsafeError: the model does not know a set-up.
+            TypeError: `targets` has a wrong type.
         """
+        check_observations("targets", targets)
         return inverse(self.data, targets)
 
     def evaluate(self, observations: Observations) -> Evaluation:
@@ -158,7 +173,9 @@ class Model:
         Raises:
             DataError: rows without positions.
             UnsafeError: the model does not know a set-up.
+            TypeError: `observations` has a wrong type.
         """
+        check_observations("observations", observations)
         return evaluate(self.data, observations)
 
     def export(self, directory: str | Path, format_name: str | None = None) -> tuple[Path, ...]:
@@ -215,8 +232,14 @@ def calibrate(
     Raises:
         DataError: rows without positions, prisms that the rig lacks, data that the method or an effect cannot use.
         UnsafeError: too few fixes, mirrored coordinates, or data of a different rig.
+        TypeError: an argument has a wrong type.
         ValueError: an unknown prior, method, effect or residual, or a rig that was not read from a text.
     """
+    check_rig(rig)
+    check_observations("observations", observations)
+    check_type(
+        "effects", effects, str, "'auto', 'none', or one str of effects, as ','.join(['backlash@q1', 'backlash@q2'])"
+    )
     _require_one_of("prior", prior, get_args(Prior))
     _require_one_of("residual", residual, get_args(Kind))
     run = _run(seed, progress)
@@ -255,8 +278,14 @@ def find_gap(
         DataError: rows without positions, prisms that the rig lacks.
         UnsafeError: too few fixes, mirrored coordinates, data of a different rig, or a held-out set-up that has no
             training rows.
+        TypeError: an argument has a wrong type.
         ValueError: an unknown prior or family, or a rig that was not read from a text.
     """
+    check_rig(rig)
+    check_observations("observations", observations)
+    if holdout is not None:
+        check_observations("holdout", holdout)
+    _require_several("families", families, "backlash")
     _require_one_of("prior", prior, get_args(Prior))
     for family in families or ():
         _require_one_of("families", family, sorted(library()))
@@ -295,8 +324,14 @@ def plan(
     Raises:
         DataError: fewer reachable poses than requested; an effect that poses cannot show.
         UnsafeError: a model of a different rig, or without that set-up; no reachable pose in view.
+        TypeError: an argument has a wrong type.
         ValueError: `poses` is below 1, an effect is unknown, or `station_mm` is not three finite numbers.
     """
+    check_rig(rig)
+    check_type("poses", poses, Integral, "the number of poses, an int")
+    if model is not None:
+        check_type("model", model, Model, "a Model, as from rigcal.Model.load('model')")
+    _require_several("separate", separate, "backlash@q1")
     if poses < 1:
         raise ValueError(f"poses is {poses}; give 1 or more")
     for effect in separate:
@@ -321,7 +356,13 @@ def _require_one_of(name: str, value: str, known: Collection[str]) -> None:
         raise ValueError(f"{name}: {value!r} is unknown; give one of {', '.join(known)}")
 
 
+def _require_several(name: str, names: Collection[str] | None, example: str) -> None:
+    if isinstance(names, str):
+        raise wrong_type(name, names, f"a list, as [{example!r}]")
+
+
 def _run(seed: int, progress: Progress | None) -> Run:
+    check_type("seed", seed, Integral, "an int, 0 or more")
     return Run(seed) if progress is None else Run(seed, progress=progress)
 
 

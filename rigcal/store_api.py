@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from calibration.errors import DataError
 from calibration.observations import Observations
 from calibration.rig.description import Rig, parse_rig
-from daemon.sessions.session_data import sessions_csv
+from daemon.sessions.session_data import require_used, sessions_csv
 from daemon.store.queries.observations import all_observations
 from daemon.store.queries.sessions import all_sessions, session
 from daemon.store.reader import Reader
@@ -62,7 +62,14 @@ class Store:
         self._reader.close()
 
     def sessions(self) -> pd.DataFrame | pl.DataFrame:
-        """Return every calibration session, oldest first: id, rig, set-up, prism, kind, state, start and end."""
+        """Return every calibration session, oldest first.
+
+        Returns:
+            One row per session: `id`, `rig`, `setup_id`, `prism`, `kind` (`check` for one that is never used for
+            training), `state` (`open`, `closed` or `aborted`), `operator`, `note`, `started_utc_ns`, `ended_utc_ns`
+            (None while it is open), and `not_used` (the reason why calibration does not use the session; None, in
+            pandas perhaps NaN, if it does).
+        """
         return self._frame(all_sessions(self._reader))
 
     def observations(self, sessions: Sequence[str] = ()) -> pd.DataFrame | pl.DataFrame:
@@ -86,15 +93,18 @@ class Store:
         """Return the rig of sessions and the observations that calibration may use, as the daemon's jobs do.
 
         Args:
-            sessions: ids of sessions of one rig. The returned rig is that of the newest session.
+            sessions: ids of sessions of one rig whose `not_used` is None, or only that the rig file has changed since.
+                The returned rig is that of the newest session.
 
         Raises:
-            DataError: there is no such session, no observation may be used, or the rig files of the sessions differ in
-                the meaning of readings.
+            DataError: there is no such session; a session is open, was aborted, or is not used for a reason and was not
+                accepted by an operator (`rigcal session accept`); no observation may be used; or the rig files of the
+                sessions differ in the meaning of readings.
         """
         found = self._require(sessions)
         if not found:
             raise DataError(str(self._reader.path), "no session given; give at least one")
+        require_used(self._reader, sessions)
         ages = [row["id"] for row in all_sessions(self._reader)]
         newest = max(found, key=lambda row: ages.index(row["id"]))
         rig = parse_rig(str(newest["rig_text"]), f"the rig of session {newest['id']}")

@@ -12,7 +12,7 @@ from pathlib import Path
 from pydantic import BaseModel, Field, PrivateAttr, ValidationError, ValidationInfo, field_validator, model_validator
 from pydantic_core import ErrorDetails
 
-from calibration.errors import RigError
+from calibration.errors import RigError, check_type
 from calibration.rig.channels import Channel, Signal
 from calibration.rig.decoding import decoded_otherwise, with_decoding
 from calibration.rig.files import rig_path, shipped_rigs
@@ -35,6 +35,7 @@ from calibration.rig.parts import (
 from calibration.rig.signals import Taken, signal_faults, signal_lines, signal_of
 from calibration.rig.toml import line_of, parse_toml
 from calibration.rig.toml_errors import place, reason
+from calibration.rig.words import counted
 
 __all__ = [
     "ANOTHER_VALUE",
@@ -49,6 +50,7 @@ __all__ = [
     "RowParameter",
     "Station",
     "Tolerances",
+    "check_rig",
     "parse_rig",
     "read_rig",
     "shipped_rig",
@@ -194,6 +196,11 @@ class Rig(Part):
                     f"give centre_mm instead of midway"
                 )
         return self
+
+    def __repr__(self) -> str:
+        return f"Rig({self.name!r}, {counted(len(self.joints), 'joint')}, {counted(len(self.prisms), 'prism')})"
+
+    __str__ = __repr__
 
     @property
     def text(self) -> str:
@@ -344,6 +351,11 @@ _SECTIONS: dict[str, type[BaseModel]] = {
     "tolerances": Tolerances,
     "station": Station,
 }
+
+
+def check_rig(rig: object) -> None:
+    """Raise TypeError if an argument `rig` is not a Rig, such as the name of a shipped one."""
+    check_type("rig", rig, Rig, "a Rig, as from rigcal.Rig.read('ur10')")
 
 
 def parse_rig(text: str, source: str) -> Rig:

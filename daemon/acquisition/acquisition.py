@@ -270,11 +270,7 @@ class Acquisition:
         ):
             return False
         self._decoded = None
-        records = [*decoded.reports, *decoded.records]
-        if self._is_left_over:
-            self._pass_on(records)  # records of an earlier run do not show the present state
-        else:
-            self._hand_on(records, decoded.until)
+        self._hand_on([*decoded.reports, *decoded.records], decoded.until)
         return True
 
     def _decode(self, now: Stamp) -> None:
@@ -383,10 +379,8 @@ class Acquisition:
                 self._insert([record])
 
     def _hand_on(self, records: Sequence[Record], until: Stamp | None) -> None:
-        self._board.recorded(records, until)
-        self._pass_on(records)
-
-    def _pass_on(self, records: Sequence[Record]) -> None:
+        if not self._is_left_over:  # records of an earlier run do not show the present state
+            self._board.recorded(records, until)
         try:
             self._on_records(records)
         except Exception:

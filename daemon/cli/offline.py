@@ -156,6 +156,11 @@ def check_out(out: Path | None, data: Path) -> None:
         raise click.UsageError(f"{out} is the input file; name a different file with --out")
 
 
+def replaced(out: Path) -> str:
+    """Return " (replaced)" for a file or a directory with files that is about to be replaced, else ""."""
+    return " (replaced)" if out.is_file() or (out.is_dir() and any(out.iterdir())) else ""
+
+
 def with_columns(raw: bytes, columns: Mapping[str, Floats], dropped: Collection[str] = ()) -> str:
     """Return an observations CSV unchanged except for replaced, added and dropped columns.
 
@@ -179,19 +184,25 @@ def with_columns(raw: bytes, columns: Mapping[str, Floats], dropped: Collection[
     return out.getvalue()
 
 
-def deliver(table: str, result: dict[str, object], warnings: Sequence[str], out: Path | None, *, as_json: bool) -> None:
+def deliver(
+    table: str, what: str, result: dict[str, object], warnings: Sequence[str], out: Path | None, *, as_json: bool
+) -> None:
     """Write a table to the file, or put it into the JSON object as "csv", or print it; print the warnings.
 
     Args:
         table: the CSV.
+        what: the rows with their number, in words: "12 positions"; shown with the file's name.
         result: the JSON object, to which the table or the path of its file is added.
         warnings: for people; the JSON object has them already.
         out: the file; None for none.
         as_json: True if standard output is for the JSON object.
     """
     if out is not None:
+        note = replaced(out)
         write_file(out, table.encode("utf-8"))
         result["out"] = str(out)
+        if not as_json:
+            echo(f"{what} written to {out}{note}")
     elif as_json:
         result["csv"] = table
     else:

@@ -137,11 +137,6 @@ def echo_table(
             echo(" " * before + text)
 
 
-def counted(count: int, noun: str) -> str:
-    """Return a number with its noun, with a plural s unless the number is 1."""
-    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
-
-
 def percent(share: float) -> str:
     """Return the share of unfinished work that is done as percentage; never 100 %."""
     return f"{min(share, _MOST_SHOWN):.0%}".replace("%", " %")

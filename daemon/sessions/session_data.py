@@ -8,7 +8,7 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 from calibration.errors import DataError
@@ -16,8 +16,9 @@ from calibration.rig.description import Rig
 from calibration.table import LABEL_COLUMNS, POSITION_COLUMNS, SIGMA_COLUMNS
 from daemon.report.calibration.inputs import ControlPoint, SetupLine
 from daemon.rig_files import HOW_TO_READ_AGAIN, misreading
+from daemon.sessions.not_used import not_used
 from daemon.store.queries.observations import moving_observations, observations
-from daemon.store.queries.sessions import OTHER_RIG_FILE, session
+from daemon.store.queries.sessions import OTHER_RIG_FILE, all_sessions, session
 from daemon.store.queries.setups import misclosures, setups_of
 from daemon.store.queries.time_axis import time_axis
 from daemon.store.reader import Reader
@@ -63,6 +64,36 @@ def sessions_csv(reader: Reader, rig: Rig, session_ids: Sequence[str], *, moving
         cells += [row[name] for name in SIGMA_COLUMNS] + [row["dwell_s"], *(measured.get(name) for name in more)]
         writer.writerow("" if cell is None else repr(cell) if isinstance(cell, float) else cell for cell in cells)
     return out.getvalue().encode()
+
+
+def require_used(reader: Reader, session_ids: Collection[str]) -> None:
+    """Raise DataError if calibration does not use one of the given sessions; its jobs use closed ones only.
+
+    A session that is not used only because the rig file has changed since passes: its own rig file reads it, and
+    `sessions_csv` refuses any other.
+
+    Args:
+        reader: the store.
+        session_ids: the sessions; a check session is used, too.
+
+    Raises:
+        DataError: a session is open, was aborted, or is excluded and was not accepted by an operator.
+    """
+    for row in all_sessions(reader):
+        name, why = row["id"], row["not_used"]
+        if why is None or name not in session_ids:
+            continue
+        if row["state"] == "open":
+            reason = f"{why}; stop it first: `rigcal session stop`"
+        elif row["state"] == "aborted":
+            reason = f"{why}, and calibration does not use aborted sessions; leave it out"
+        elif why.startswith(OTHER_RIG_FILE):
+            if "; " not in why:  # the only reason
+                continue
+            reason = f"{why}; {HOW_TO_READ_AGAIN}"
+        else:
+            reason = not_used(name, why)
+        raise DataError(f"session {name}", reason)
 
 
 @dataclass(frozen=True)

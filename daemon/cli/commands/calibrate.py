@@ -132,11 +132,12 @@ def calibrate(
                 report_input(training, None, made_utc_ns=watch.utc_ns, sources=sources, facts=facts)
             )
             loaded.result()
+        note = offline.replaced(out)
         model_files.write_model(out, model, {model_files.REPORT: document.encode("utf-8")})
     result = training.as_dict(watch.seconds)
     if not as_json:
         offline.show_evaluation(result, f"the {len(training)} fixes it was fitted to")
-        echo(f"Model: {out}   report: {out / model_files.REPORT}   {result['seconds']} s")
+        echo(f"Model: {out}{note}   report: {out / model_files.REPORT}   {result['seconds']} s")
     rows = f"on the {len(training)} fixes it was fitted to"
     rms_mm = float(training.stages()[-1]["rms_mm"])
     return offline.judged(result, tolerance_mm, rms_mm, rows, is_held_out=False, as_json=as_json)

@@ -90,12 +90,13 @@ def gap(
         document = gap_report(found, provenance(found.model, watch.utc_ns, files), facts)
         verdict = tolerance_verdict(found, tolerance_mm)
         result = gap_answer(found, watch.seconds) | ({} if verdict is None else {"tolerance": verdict.as_dict()})
+        note = offline.replaced(out)
         write_gap(out, found, result, document)
     if not as_json:
         show_gap(found)
         if verdict is not None:
             offline.show_verdict(verdict)
-        echo(f"Model: {out / 'model'}   report: {out / REPORT}   {result['seconds']} s")
+        echo(f"Model: {out / 'model'}{note}   report: {out / REPORT}   {result['seconds']} s")
     return result
 
 

@@ -12,9 +12,10 @@ from typing import Any
 
 import click
 
+from calibration.rig.words import counted
 from daemon.cli.client import STATUS_TIMEOUT_S, client_options, socket_of
 from daemon.cli.command import Command, Delivered
-from daemon.cli.terminal import counted, echo
+from daemon.cli.terminal import echo
 from daemon.commands import CommandError
 from daemon.control.protocol import request
 from daemon.host.safe_output import duration

@@ -7,6 +7,7 @@ from pathlib import Path
 import click
 
 from calibration.rig.columns import CLOSURE
+from calibration.rig.words import counted
 from daemon.cli import offline
 from daemon.cli.command import REFUSED, Command, Delivered, json_option
 from daemon.warm_up import prepare
@@ -58,5 +59,6 @@ def inverse(directory: Path, data: Path, out: Path | None, *, as_json: bool) -> 
         "warnings": list(found.warnings),
         "ignored_columns": list(targets.ignored_columns),
     }
-    offline.deliver(table, result, found.warnings, out, as_json=as_json)
+    what = f"joint values for {counted(len(targets), 'position')}"
+    offline.deliver(table, what, result, found.warnings, out, as_json=as_json)
     return Delivered(result, REFUSED) if unreached else result

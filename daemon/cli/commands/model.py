@@ -11,6 +11,7 @@ import click
 
 from daemon.cli.client import ask, client_options, operator_option, socket_of, utc, who
 from daemon.cli.command import Command
+from daemon.cli.offline import replaced
 from daemon.cli.terminal import echo, echo_error, echo_table
 from daemon.control.protocol import request
 from daemon.host.safe_output import write_file
@@ -182,6 +183,7 @@ def model_export(
     export = Export(read_model(directory), model_sha256(directory), prisms, rows)
     contents = {made.file: made.content(export) for made in chosen}
     out.mkdir(parents=True, exist_ok=True)
+    notes = {name: replaced(out / name) for name in contents}
     for name, data in contents.items():
         write_file(out / name, data)
     left_out = {made.file: made.left_out(export) for made in chosen}
@@ -195,7 +197,7 @@ def model_export(
     result |= export.summary if has_grid else {}
     if not as_json:
         for made in chosen:
-            echo(str(out / made.file), bold=True)
+            echo(f"{out / made.file}{notes[made.file]}", bold=True)
             for sentence in left_out[made.file].sentences:
                 echo(f"  {sentence}")
         for sentence in warnings:

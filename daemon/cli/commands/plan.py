@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from daemon.cli.command import Command, json_option, progress_display
-from daemon.cli.offline import FiniteNumber, rig_option, seed_option
+from daemon.cli.offline import FiniteNumber, replaced, rig_option, seed_option
 from daemon.cli.terminal import echo, echo_list, echo_table
 from daemon.host.safe_output import write_file
 from daemon.report.words import number
@@ -106,12 +106,15 @@ def plan(
             separate=effects,
             run=Run(seed, progress=progress),
         )
-    result = planned.as_dict()
+    result, note = planned.as_dict(), ""
     if out is not None:
+        note = replaced(out)
         write_file(out, poses_csv([row.as_dict() for row in planned.rows]).encode("utf-8"))
         result["out"] = str(out)
     if not as_json:
         _show(planned, result)
+        if out is not None:
+            echo(f"Poses: {out}{note}")
     return result
 
 
@@ -176,8 +179,6 @@ def _show(planned: PosePlan, result: Mapping[str, Any]) -> None:
         ("Assumed", result["assumptions"]),
     ):
         echo_list(title, sentences)
-    if "out" in result:
-        echo(f"Poses: {result['out']}")
 
 
 def _condition(name: str, value: float) -> str:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from calibration.rig.columns import INTERVALS, PREDICTED, names
+from calibration.rig.words import counted
 from daemon.cli import offline
 from daemon.cli.command import Command, json_option
 from daemon.warm_up import prepare
@@ -60,7 +61,7 @@ def predict(directory: Path, data: Path, out: Path | None, *, intervals: bool, a
         "warnings": list(warnings),
         "ignored_columns": list(observations.ignored_columns),
     }
-    offline.deliver(table, result, warnings, out, as_json=as_json)
+    offline.deliver(table, counted(len(observations), "position"), result, warnings, out, as_json=as_json)
     return result
 
 

@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from calibration.rig.words import counted
 from daemon.cli.command import WRONG_INPUT, Command, json_option, out_file_option
 from daemon.cli.lines.fill_in import fill_in_lines, fill_in_note
 from daemon.cli.offline import FILE
-from daemon.cli.terminal import counted, echo, echo_error, echo_list, echo_table
+from daemon.cli.terminal import echo, echo_error, echo_list, echo_table
 from daemon.commands import CommandError
 from daemon.host.safe_output import write_file
 from daemon.report.words import number

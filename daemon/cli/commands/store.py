@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from calibration.rig.words import counted
 from daemon.cli.client import config_option, utc
 from daemon.cli.command import DONE, FAILED, Command, Delivered, json_option
-from daemon.cli.terminal import counted, echo, echo_error
+from daemon.cli.terminal import echo, echo_error
 
 if TYPE_CHECKING:
     from daemon.config.config import Config

@@ -10,6 +10,7 @@ from daemon.cli.lines.clock import session_clock_lines
 from daemon.cli.terminal import echo
 from daemon.host.safe_output import duration
 from daemon.report.words import number
+from daemon.sessions.not_used import not_used
 
 _NAMES_SHOWN = 6  # in one line
 _EXPERIMENTS_SHOWN = 3
@@ -114,8 +115,7 @@ def show_session(session: Mapping[str, Any]) -> None:
     if session["setup_moved"]:
         echo("  the station has moved since this set-up was recorded", fg="red")
     if session["not_used"] is not None:
-        why = f"{session['not_used']}; to use it anyway: `rigcal session accept {session['id']}`"
-        echo(f"  calibration does not use this session: {why}", fg="red")
+        echo(f"  {not_used(session['id'], session['not_used'])}", fg="red")
     if session["accepted"] is not None:
         accepted = session["accepted"]
         by = who(accepted["by"], accepted["user"]) or "an operator"

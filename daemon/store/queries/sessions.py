@@ -19,6 +19,9 @@ from daemon.store.rows import RowSource, marks
 from daemon.store.views import in_session
 from drivers.clock import NS_PER_S, Stamp
 
+# Why calibration does not use a session, a clause; NULL if it does. All queries of used sessions are made from this.
+_NOT_USED = """CASE state WHEN 'open' THEN 'it is still open' WHEN 'aborted' THEN 'it was aborted' ELSE excluded END"""
+_USED = f"SELECT rowid AS number, * FROM calibration_sessions WHERE ({_NOT_USED}) IS NULL"
 BEFORE_NS = 60 * NS_PER_S  # dwell and direction of a session's first fixes depend on motion before it
 AFTER_NS = 2 * NS_PER_S  # a session's last fixes are interpolated between joint readings up to this time after it
 CLOCK_STEP_NS = NS_PER_S // 20  # a smaller difference may be the time between reading the two clocks
@@ -96,8 +99,7 @@ _STANDSTILLS = """SELECT id, session_id, prism, x_mm, y_mm, z_mm, values_json FR
 _UNTRAINED = f"""SELECT id, excluded FROM calibration_sessions
     WHERE rig = ?1 AND state = 'closed' AND excluded IS NOT NULL AND excluded NOT LIKE '{OTHER_RIG_FILE}%'
         AND excluded NOT LIKE '{ZERO_LOST}%' AND rowid >
-        (SELECT coalesce(max(rowid), 0) FROM calibration_sessions
-            WHERE rig = ?1 AND state = 'closed' AND excluded IS NULL)
+        (SELECT coalesce(max(number), 0) FROM ({_USED}) WHERE rig = ?1)
     ORDER BY rowid"""
 _WITH_RIG = """SELECT calibration_sessions.*, rig_files.text AS rig_text FROM calibration_sessions
     LEFT JOIN rig_files ON rig_files.sha256 = rig_sha256"""
@@ -207,17 +209,13 @@ class SessionTable:
 
     def used(self) -> list[dict[str, Any]]:
         """Return id and kind of the rig's closed sessions that calibration may use, oldest first."""
-        return self._store.rows(
-            "SELECT id, kind FROM calibration_sessions WHERE rig = ? AND state = 'closed' AND excluded IS NULL "
-            "ORDER BY rowid",
-            (self._rig,),
-        )
+        return self._store.rows(f"SELECT id, kind FROM ({_USED}) WHERE rig = ? ORDER BY number", (self._rig,))
 
     def used_like(self, session_id: str) -> str | None:
         """Return the newest other session of the same prism in the same set-up that calibration may use, if any."""
-        sql = """SELECT other.id FROM calibration_sessions AS own JOIN calibration_sessions AS other
+        sql = f"""SELECT other.id FROM calibration_sessions AS own JOIN ({_USED}) AS other
                 ON other.setup_id = own.setup_id AND other.prism = own.prism AND other.id <> own.id
-            WHERE own.id = ? AND other.state = 'closed' AND other.excluded IS NULL ORDER BY other.rowid DESC LIMIT 1"""
+            WHERE own.id = ? ORDER BY other.number DESC LIMIT 1"""
         return next((row["id"] for row in self._store.rows(sql, (session_id,))), None)
 
     def closed(self) -> list[dict[str, Any]]:
@@ -367,20 +365,18 @@ def sessions_between(source: RowSource, since: Stamp, until: Stamp, boot: int) -
 
 
 def all_sessions(source: RowSource) -> list[dict[str, Any]]:
-    """Return every session without its rig file, oldest first."""
+    """Return every session without its rig file, oldest first, with `not_used`: None if calibration uses it."""
     return list(
         source.rows(
-            "SELECT id, rig, setup_id, prism, kind, state, operator, note, started_utc_ns, ended_utc_ns "
-            "FROM calibration_sessions ORDER BY rowid"
+            "SELECT id, rig, setup_id, prism, kind, state, operator, note, started_utc_ns, ended_utc_ns, "
+            f"{_NOT_USED} AS not_used FROM calibration_sessions ORDER BY rowid"
         )
     )
 
 
 def sessions_of_use(source: RowSource) -> tuple[list[str], list[str]]:
     """Return the closed sessions that calibration may use, oldest first: training sessions and check sessions."""
-    rows = source.rows(
-        "SELECT id, kind FROM calibration_sessions WHERE state = 'closed' AND excluded IS NULL ORDER BY rowid"
-    )
+    rows = source.rows(f"SELECT id, kind FROM ({_USED}) ORDER BY number")
     found = [(row["id"], row["kind"] == "check") for row in rows]
     return [name for name, is_check in found if not is_check], [name for name, is_check in found if is_check]
 

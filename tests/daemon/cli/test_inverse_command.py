@@ -80,6 +80,7 @@ def test_a_target_out_of_reach_is_delivered_with_status_3(model: Path, targets: 
     assert any("1 of 12 targets are out of reach" in warning for warning in answer["warnings"])
     plain = run("inverse", "--model", model, "--data", far, "--out", out)
     assert plain.exit_code == 3
+    assert plain.stdout == f"joint values for 12 positions written to {out} (replaced)\n"
     assert "Warning: 1 of 12 targets are out of reach" in plain.stderr
 
 

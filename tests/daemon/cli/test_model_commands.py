@@ -89,6 +89,17 @@ def test_a_grid_too_coarse_to_mend_much_is_exported_with_a_warning(tmp_path: Pat
     assert f"Warning: {told['warnings'][0]}" in CliRunner().invoke(main, command).stderr
 
 
+def test_exported_files_that_were_there_before_are_said_to_be_replaced(tmp_path: Path) -> None:
+    out = tmp_path / "x"
+    command = ("model", "export", "--model", str(written(30)), "--out", str(out))
+    assert "replaced" not in CliRunner().invoke(main, [*command, "--format", "json"]).stdout
+    both = CliRunner().invoke(main, [*command, "--format", "json", "--format", "c-header"]).stdout.splitlines()
+    assert [line for line in both if line.startswith(str(out))] == [
+        str(out / "rigcal_model.h"),
+        f"{out / 'calibration.json'} (replaced)",
+    ]
+
+
 def _multilinear(axes: list[np.ndarray], table: np.ndarray, pose: np.ndarray) -> np.ndarray:
     """Linear in each joint value in turn, as a controller would do it."""
     for axis, value in zip(axes, pose, strict=True):

@@ -177,7 +177,7 @@ def test_evaluate_answers_with_the_contract(work: Path) -> None:
 def test_predict_writes_the_input_columns_and_its_own(work: Path, tmp_path: Path) -> None:
     out = tmp_path / "predicted.csv"
     result = run("predict", "--model", work / "model", "--data", work / "test.csv", "--out", out)
-    assert (result.exit_code, result.stdout) == (0, "")
+    assert (result.exit_code, result.stdout) == (0, f"60 positions written to {out}\n")
     rows = list(csv.DictReader(io.StringIO(out.read_text())))
     given = list(csv.DictReader(io.StringIO(held_out_csv().decode())))
     assert list(rows[0]) == [*given[0], *PREDICTED_COLUMNS]
@@ -187,6 +187,24 @@ def test_predict_writes_the_input_columns_and_its_own(work: Path, tmp_path: Path
     sigma = np.array([[float(row[f"sigma_{c}_pred_mm"]) for c in "xyz"] for row in rows])
     assert np.linalg.norm(measured - predicted, axis=1).max() < 3.0
     assert (sigma > 0).all()
+
+
+def test_a_file_of_predictions_that_was_there_before_is_said_to_be_replaced(work: Path, tmp_path: Path) -> None:
+    out = tmp_path / "predicted.csv"
+    asked = ("predict", "--model", work / "model", "--data", work / "test.csv", "--out", out)
+    json_keys = [list(json.loads(run(*asked, "--json").stdout)) for _ in range(2)]
+    assert json_keys[0] == json_keys[1]
+    assert run(*asked).stdout == f"60 positions written to {out} (replaced)\n"
+
+
+@pytest.mark.long
+def test_a_model_that_was_there_before_is_said_to_be_replaced(work: Path, tmp_path: Path) -> None:
+    out = tmp_path / "model"
+    asked = ("calibrate", "--rig", "ur10", "--data", work / "train.csv", "--out", out)
+    for note in ("", " (replaced)"):
+        told = run(*asked, "--effects", "none", "--residual", "none")
+        assert told.exit_code == 0, told.stderr
+        assert f"Model: {out}{note}   report: " in told.stdout
 
 
 def test_predict_gives_intervals_where_they_are_asked_for(work: Path) -> None:

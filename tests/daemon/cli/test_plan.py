@@ -88,6 +88,13 @@ def test_two_effects_are_told_apart_and_the_approach_is_part_of_the_plan(tmp_pat
     assert {row["theta3_dir"] for row in rows} == {"-1", "1"}
 
 
+def test_a_file_of_poses_that_was_there_before_is_said_to_be_replaced(tmp_path: Path) -> None:
+    out = tmp_path / "poses.csv"
+    for note in ("", " (replaced)"):
+        told = run("plan", "--rig", "ur10", "--poses", 3, "--out", out)
+        assert told.stdout.endswith(f"Poses: {out}{note}\n")
+
+
 @pytest.mark.long
 def test_after_a_session_it_says_what_else_to_measure(tmp_path: Path) -> None:
     write_model(tmp_path / "model", small_calibration()[0])

@@ -12,6 +12,7 @@ from calibration.rig.description import Rig as Machine
 from calibration.rig.description import parse_rig
 from daemon.commands import CommandError
 from daemon.rig_files import load_rig, misreading
+from daemon.sessions.not_used import not_used
 from daemon.sessions.session_data import sessions_csv
 from daemon.store.queries.sessions import SessionTable
 from daemon.store.upkeep.retention import LAST, free_stretches
@@ -131,12 +132,16 @@ def test_no_word_of_an_operator_makes_readings_of_another_rig_file_good(session_
     with pytest.raises(CommandError, match=r"another rig file.*`rigcal replay`") as caught:
         session_rig.say("accept", id=name)
     assert caught.value.status == 3
+    told = not_used(name, session_rig.say("show", id=name)["not_used"])
+    assert "`rigcal replay`" in told
+    assert "session accept" not in told, "it would be refused"
 
 
 def test_data_of_two_rig_files_are_refused_wherever_they_are_read(session_rig: Rig) -> None:
     before = controlled(session_rig)
     change_rig_file(session_rig, other(*ANOTHER_NAME))
     after = controlled(session_rig)
+    session_rig.say("accept", id=after)  # nothing reads roll8, so no fix between its shots counts
     why = f"session {before}: it was recorded with another rig file: it has no joint roll8"
     with contextlib.closing(session_rig.store.reader()) as reader, pytest.raises(DataError, match=why):
         sessions_csv(reader, session_rig.machine, [before, after])
