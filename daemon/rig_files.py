@@ -13,8 +13,6 @@ from calibration.rig.files import rig_path
 from calibration.rig.toml import LONGEST
 from drivers.files import read_text
 
-HOW_TO_READ_AGAIN = "to read its captures with this one, `rigcal session export` it, and `rigcal replay` the files"
-
 
 @dataclass(frozen=True)
 class RigSource:

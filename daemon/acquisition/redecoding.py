@@ -10,8 +10,8 @@ from typing import Any
 
 from calibration.rig.description import Rig
 from daemon.acquisition.link_decoders import LinkDecoders
-from daemon.commands import REFUSED, CommandError
-from daemon.rig_files import HOW_TO_READ_AGAIN, misreading, tells_decoding
+from daemon.commands import HOW_TO_READ_AGAIN, REFUSED, CommandError
+from daemon.rig_files import misreading, tells_decoding
 from daemon.store import Store
 from daemon.store.queries.decoding import decoded_before
 from daemon.store.queries.device_states import device_states

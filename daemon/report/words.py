@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+from daemon.commands import HOW_TO_READ_AGAIN, OTHER_RIG_FILE
+
 INTERVAL_SIGMAS = 2.0  # standard errors of a 95 % interval
 DASH = "\N{EN DASH}"
 MINUS = "\N{MINUS SIGN}"
@@ -95,3 +97,18 @@ def spoken(effects: Sequence[tuple[str, str]]) -> str:
 def listed(words: Sequence[str]) -> str:
     """Join words as in a sentence: `a, b and c`."""
     return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}" if words else ""
+
+
+# ---- sessions --------------------------------------------------------------------------------------------------------
+
+
+def not_used(session_id: str, reason: str) -> str:
+    """Return a sentence on a closed session that calibration does not use, with what to do.
+
+    Args:
+        session_id: the session.
+        reason: why it is not used, a clause.
+    """
+    accept = f"to use it anyway: `rigcal session accept {session_id}`"
+    remedy = HOW_TO_READ_AGAIN if reason.startswith(OTHER_RIG_FILE) else accept
+    return f"calibration does not use this session: {reason}; {remedy}"

@@ -18,9 +18,9 @@ from typing import Any
 
 from calibration.rig.decoding import without_decoding
 from calibration.rig.description import Rig
-from daemon.commands import REFUSED, CommandError, caller_columns
+from daemon.commands import HOW_TO_READ_AGAIN, OTHER_RIG_FILE, REFUSED, CommandError, caller_columns
 from daemon.host.time_service import ClockState
-from daemon.rig_files import HOW_TO_READ_AGAIN, misreading
+from daemon.rig_files import misreading
 from daemon.sessions.open_session import CONSTANT_TOLERANCE_MM, OpenSession
 from daemon.store.connection import rig_sha256
 from daemon.store.queries.jobs import JobTable
@@ -29,7 +29,6 @@ from daemon.store.queries.poses import has_poses_before_enclosed, is_enclosed
 from daemon.store.queries.sessions import (
     OPEN_AT_NEXT,
     OPEN_IN_BACKUP,
-    OTHER_RIG_FILE,
     ZERO_LOST,
     SessionTable,
     session,

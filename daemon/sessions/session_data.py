@@ -14,11 +14,12 @@ from dataclasses import dataclass
 from calibration.errors import DataError
 from calibration.rig.description import Rig
 from calibration.table import LABEL_COLUMNS, POSITION_COLUMNS, SIGMA_COLUMNS
+from daemon.commands import HOW_TO_READ_AGAIN, OTHER_RIG_FILE
 from daemon.report.calibration.inputs import ControlPoint, SetupLine
-from daemon.rig_files import HOW_TO_READ_AGAIN, misreading
-from daemon.sessions.not_used import not_used
+from daemon.report.words import not_used
+from daemon.rig_files import misreading
 from daemon.store.queries.observations import moving_observations, observations
-from daemon.store.queries.sessions import OTHER_RIG_FILE, all_sessions, session
+from daemon.store.queries.sessions import all_sessions, session
 from daemon.store.queries.setups import misclosures, setups_of
 from daemon.store.queries.time_axis import time_axis
 from daemon.store.reader import Reader

@@ -11,8 +11,8 @@ import pytest
 
 import rigcal
 from daemon.cli.lines.state import show_session
-from daemon.rig_files import HOW_TO_READ_AGAIN
-from daemon.store.queries.sessions import OTHER_RIG_FILE, SessionTable, sessions_of_use
+from daemon.commands import HOW_TO_READ_AGAIN, OTHER_RIG_FILE
+from daemon.store.queries.sessions import SessionTable, sessions_of_use
 from daemon.store.reader import Reader
 from tests.daemon.support.sessions import SOURCE, Rig, controlled
 

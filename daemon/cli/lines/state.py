@@ -9,8 +9,7 @@ from daemon.cli.client import utc, who
 from daemon.cli.lines.clock import session_clock_lines
 from daemon.cli.terminal import echo
 from daemon.host.safe_output import duration
-from daemon.report.words import number
-from daemon.sessions.not_used import not_used
+from daemon.report.words import not_used, number
 
 _NAMES_SHOWN = 6  # in one line
 _EXPERIMENTS_SHOWN = 3

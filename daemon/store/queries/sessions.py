@@ -8,6 +8,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from daemon.commands import OTHER_RIG_FILE
 from daemon.host.time_service import ClockState
 from daemon.store.connection import Connection
 from daemon.store.errors import NotInStoreError
@@ -45,7 +46,6 @@ _OTHER_INSTANTS = """SELECT boot_id, monotonic_ns, utc_ns, 0 AS is_before FROM c
             ORDER BY rowid DESC LIMIT 1)"""
 # Prefixes of the reason why a session is not used: it was recorded with a different rig file, or before a joint's zero
 # was lost. Stored reasons are compared with these prefixes, so they must not change.
-OTHER_RIG_FILE = "it was recorded with another rig file: "
 ZERO_LOST = "an encoder has jumped since, and nobody has checked its zero: "
 # Beginnings of reasons that only an operator can end, as nothing else in the store shows them
 OPEN_IN_BACKUP = "the session was open in the backup"

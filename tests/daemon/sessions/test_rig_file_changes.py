@@ -11,8 +11,8 @@ from calibration.errors import DataError
 from calibration.rig.description import Rig as Machine
 from calibration.rig.description import parse_rig
 from daemon.commands import CommandError
+from daemon.report.words import not_used
 from daemon.rig_files import load_rig, misreading
-from daemon.sessions.not_used import not_used
 from daemon.sessions.session_data import sessions_csv
 from daemon.store.queries.sessions import SessionTable
 from daemon.store.upkeep.retention import LAST, free_stretches
