@@ -121,13 +121,14 @@ def simulated_machine(rig: str, seed: int, effects: Sequence[str], *, has_secret
     return f"{SIMULATED_BOOT}{hashlib.sha256(told.encode()).hexdigest()[:8]}-"
 
 
-def require_apart(boots: Sequence[str], store: Path, machine: str | None) -> None:
+def require_apart(boots: Sequence[str], store: Path, machine: str | None, options: str = "") -> None:
     """Refuse to mix records of different machines in one store: models would be made of both.
 
     Args:
         boots: boot ids in the store.
         store: path of the store.
         machine: the simulated machine that is about to run on the store (`simulated_machine`); None for the real one.
+        options: options of `rigcal run --sim` for the simulated machine of the store; "" if they are unknown.
 
     Raises:
         CommandError: the store holds records of a real machine and the present one is simulated, or the reverse, or of
@@ -136,8 +137,8 @@ def require_apart(boots: Sequence[str], store: Path, machine: str | None) -> Non
     is_simulated = machine is not None
     if machine and any(_MACHINE.match(boot) and not boot.startswith(machine) for boot in boots):
         raise CommandError(
-            f"{store} was measured on a different simulated machine; start that one again with its --rig, --seed and "
-            f"--effect, or move {store.parent} away for a new one",
+            f"{store} was measured on a different simulated machine; start that one again with "
+            f"{options or 'its --rig, --seed and --effect'}, or move {store.parent} away for a new one",
             REFUSED,
         )
     if is_simulated and any(_KERNEL_BOOT.fullmatch(boot) for boot in boots):

@@ -21,6 +21,7 @@ from daemon.rig_files import load_rig
 from daemon.service import Daemon
 from daemon.store import Store, StoreError
 from drivers.clock import NS_PER_S, SystemClock
+from tests.daemon.support.acquisition import wait_until
 from tests.daemon.support.damage import fill, small_disk
 from tests.daemon.support.jobs import SOURCE
 
@@ -144,6 +145,21 @@ def test_a_store_of_another_simulated_machine_is_refused() -> None:
         with pytest.raises(CommandError, match="was measured on a different simulated machine; start that one again"):
             require_apart([f"{other}{uuid.uuid4()}"], Path("rigcal.sqlite"), name)
     require_apart([f"{name}{uuid.uuid4()}"], Path("rigcal.sqlite"), name)
+
+
+def test_a_store_of_another_simulated_machine_is_refused_with_the_options_of_its_own(tmp_path: Path) -> None:
+    config = tmp_path / "rigcal.toml"
+    config.write_text(CONFIG.format(state=tmp_path) + '[[station]]\nserial.path = "/dev/none"\n', encoding="utf-8")
+    command = [sys.executable, "-m", "daemon.cli.main", "run", "--sim", "--config", str(config)]
+    first = subprocess.Popen([*command, "--effect", "backlash@theta4"], stderr=subprocess.DEVNULL)
+    try:
+        wait_until((tmp_path / "control.sock").exists)
+    finally:
+        first.terminate()
+        assert first.wait(60) == 0
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    assert ended.returncode == REFUSED
+    assert "start that one again with --rig swdt82 --seed 1 --effect=backlash@theta4, or move" in ended.stderr
 
 
 def test_simulated_time_that_ran_fast_does_not_run_backwards_at_the_next_start(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -83,9 +84,10 @@ def test_the_public_face_is_that_of_the_wheel(home: Home) -> None:
 def demo(home: Home) -> Iterator[dict[str, Any]]:
     """The demonstration's result; its daemon runs again, with its store and models."""
     result = home.rigcal("demo", "--out", "demo")
+    machine = shlex.split((home.directory / "demo" / "simulated-machine.txt").read_text(encoding="utf-8"))
     with (home.directory / "daemon.log").open("w") as log:
         daemon = subprocess.Popen(
-            [home.bin / "rigcal", "run", "--sim", "--config", "demo/rigcal.toml"],
+            [home.bin / "rigcal", "run", "--sim", "--config", "demo/rigcal.toml", *machine],
             cwd=home.directory,
             env=home.environment,
             stderr=log,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import shlex
 import tempfile
 import threading
 from collections.abc import Sequence
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     from daemon.store.store import Store
 
 SIMULATED_FILE = Path("rigcal-sim", "rigcal.toml")
+MACHINE_FILE = "simulated-machine.txt"  # in the directory of the store: the options of its simulated machine
 
 _RATE = click.FloatRange(0.1, 100)
 _DWELL = click.FloatRange(1, 600)
@@ -122,6 +124,7 @@ def run(
             machine = simulated_machine(source.rig.name, seed, effects, has_secret=secret is not None) if sim else None
             store = stack.enter_context(contextlib.closing(_store(settings, machine)))
             if sim:
+                _note_machine(settings, seed, effects, secret)
                 rig_parts = simulated(
                     settings,
                     source,
@@ -163,11 +166,30 @@ def _store(settings: Config, machine: str | None) -> Store:
 
     store = Store(settings.store_path)
     try:
-        store.unless_damaged(lambda: require_apart(store.boots(), store.path, machine), None)
+        options = _machine_options(settings)
+        store.unless_damaged(lambda: require_apart(store.boots(), store.path, machine, options), None)
     except BaseException:
         store.close()
         raise
     return store
+
+
+def _note_machine(settings: Config, seed: int, effects: Sequence[str], secret: Path | None) -> None:
+    """Write the options of the simulated machine beside its store, for the message that refuses another machine."""
+    from daemon.host.safe_output import write_file
+
+    given = ["--rig", settings.rig, "--seed", str(seed), *(f"--effect={effect}" for effect in effects)]
+    given += [] if secret is None else ["--secret", str(secret)]
+    write_file(settings.state_directory / MACHINE_FILE, f"{shlex.join(given)}\n".encode())
+
+
+def _machine_options(settings: Config) -> str:
+    """Return the options of the simulated machine that ran last on the store; "" if there was none."""
+    from daemon.host.safe_output import shown
+
+    with contextlib.suppress(OSError, UnicodeError):
+        return shown((settings.state_directory / MACHINE_FILE).read_text(encoding="utf-8").strip())
+    return ""
 
 
 def _simulated_settings() -> Config:
