@@ -162,11 +162,11 @@ class ObservationMaker:
                 return f"{joint} jumped: its readings after the jump do not fit those before"
         if session.is_control_point(place_mm):
             return OF_CONTROL_POINT
-        suspected = self._prisms.follow(session, joined, place_mm)
+        self._prisms.follow(session, joined, place_mm)
         if session.kind in STANDING_KINDS and joined.standstill is None:
             self._prisms.note_moving(session, joined)
             # A suspicion is stored: a restart before the boom stands must not end it, and it is no fix of the prism
-            return suspected or self._prisms.doubt(session, joined.fix) or MOVING
+            return self._prisms.doubt(session, joined.fix) or MOVING
         return None
 
     def _why_another_prism(self, session: OpenSession, joined: JoinedFix, place_mm: Place) -> str | None:

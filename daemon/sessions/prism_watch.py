@@ -84,10 +84,9 @@ class PrismWatch:
             joined: the fix with its joints.
             place_mm: place of its target in the station's frame.
         """
-        guard, evidence = session.guards.get(joined.fix.station), session.evidence
-        turn = None if guard is None else guard.turn(joined.fix.stamp)
-        if guard is None or evidence is None or turn is None:
+        if (followed := _followed(session, joined)) is None:
             return {}
+        _, evidence, turn = followed
         changed: Exclusions = {}
         stretch = evidence.stretch(joined.fix.station, turn.at, turn.is_believed)
         for finding in evidence.take(stretch, joined, place_mm):
@@ -98,13 +97,12 @@ class PrismWatch:
 
     def note_moving(self, session: OpenSession, joined: JoinedFix) -> None:
         """Note a fix given to `see` of a moving boom: later verdicts on its target apply to it as well."""
-        guard, evidence = session.guards.get(joined.fix.station), session.evidence
-        turn = None if guard is None else guard.turn(joined.fix.stamp)
-        if evidence is not None and turn is not None:
+        if (followed := _followed(session, joined)) is not None:
+            _, evidence, turn = followed
             stretch = evidence.stretch(joined.fix.station, turn.at, turn.is_believed)
             stretch.instants_ns.append(joined.stamp.monotonic_ns)
 
-    def follow(self, session: OpenSession, joined: JoinedFix, place_mm: Place) -> str | None:
+    def follow(self, session: OpenSession, joined: JoinedFix, place_mm: Place) -> None:
         """Compare a fix given to `see`, used or not, with the motion of the joints since the previous fix.
 
         A target that has moved differently is another target, even if a prism could have moved as far. Which of the two
@@ -115,26 +113,22 @@ class PrismWatch:
             session: session in which the fix was measured.
             joined: the fix with its joints.
             place_mm: place of its target in the station's frame.
-
-        Returns:
-            Reason of a suspicion that begins with this fix; None if none does.
         """
-        guard, evidence = session.guards.get(joined.fix.station), session.evidence
-        turn = None if guard is None else guard.turn(joined.fix.stamp)
-        if guard is None or evidence is None or turn is None:
-            return None
+        if (followed := _followed(session, joined)) is None:
+            return
+        guard, evidence, turn = followed
         is_suspected = guard.doubt(joined.fix.stamp) is not None
         jump_m = evidence.jump_m(joined, place_mm, turn, is_suspected=is_suspected)
         if jump_m is None:
-            return None
+            return
         is_told = guard.may_turn(joined.fix.stamp)
         turn = guard.part(joined.fix.stamp)
         if is_told:
-            return None
+            return
         text = _moved_otherwise(jump_m, session.prism)
-        reason = None if is_suspected else guard.suspect(turn, jump_m, text).reason
+        if not is_suspected:
+            guard.suspect(turn, jump_m, text)
         self._tell_of_jump(joined.fix.station, text)
-        return reason
 
     def _stray(self, session: OpenSession, joined: JoinedFix, turn: Turn, stretch: Stretch) -> Exclusions:
         """Suspect all fixes since a turn if the target strayed from the joints' motion; return their exclusions.
@@ -256,6 +250,13 @@ class PrismWatch:
             limit = self._limits.get(station, MotionLimit())
             session.guards[station] = PrismGuard(station, limit, session.confirmations, self._store.order)
         return session.guards[station]
+
+
+def _followed(session: OpenSession, joined: JoinedFix) -> tuple[PrismGuard, PrismEvidence, Turn] | None:
+    """Return guard, evidence and turn of the target that a fix given to `see` is of; None if nothing is known of it."""
+    guard, evidence = session.guards.get(joined.fix.station), session.evidence
+    turn = None if guard is None else guard.turn(joined.fix.stamp)
+    return None if guard is None or evidence is None or turn is None else (guard, evidence, turn)
 
 
 def as_dict(suspicion: Suspicion) -> dict[str, Any]:

@@ -25,6 +25,7 @@ ChannelKind = Literal["joint", "signal"]
 
 WHOLE_DAEMON = "daemon"  # channel of gaps during which rigcal itself was not running
 
+_NEWEST_RUN = "SELECT * FROM daemon_runs ORDER BY id DESC LIMIT 1"
 _SAMPLE_COLUMNS = "(channel_id, utc_ns, monotonic_ns, boot_id, value, status, raw_counts) VALUES (?, ?, ?, ?, ?, ?, ?)"
 _SAMPLES = {
     "joint": f"INSERT INTO joint_samples {_SAMPLE_COLUMNS}",
@@ -113,20 +114,12 @@ class Store(Connection):
 
     def _note_gap(self, db: Database, now: Stamp) -> None:
         """Store the gap since the previous run, and close the gaps that it left open."""
-        runs = self.rows("SELECT * FROM daemon_runs ORDER BY id DESC LIMIT 1")
+        runs = self.rows(_NEWEST_RUN)
         if not runs:
             return
         self.ended_in_order = bool(runs[0]["clean"])
         since = self.stamp(runs[0], "alive_")
-        last = self.stamp_or_none(runs[0], "ended_") or since
-        # A killed run may have stored captures after its last heartbeat, but perhaps not all that arrived.
-        for row in self.rows(
-            "SELECT last_utc_ns, last_monotonic_ns, last_boot_id FROM raw_chunks ORDER BY id DESC LIMIT 1"
-        ):
-            captured = self.stamp(row, "last_")
-            if captured.boot_id == last.boot_id and captured.monotonic_ns > last.monotonic_ns:
-                last = captured
-        self.previous_end = last
+        self.previous_end = last = self._end_of(runs[0])
         ended = self.instant(last, "end_")
         settings = ", ".join(f"{name} = ?" for name in ended)
         # A gap that began after the last known instant ends where it began, because nothing more is known
@@ -136,12 +129,22 @@ class Store(Connection):
         db.execute(f"UPDATE gaps SET {settings} WHERE end_utc_ns IS NULL", [*ended.values()])
         self.insert_records([Gap(WHOLE_DAEMON, GapReason.NOT_RUNNING, since, now)])
 
+    def _end_of(self, run: Mapping[str, Any]) -> Stamp:
+        """Return the last instant of the newest run: its end, its last heartbeat, or that of its last captures."""
+        last = self.stamp_or_none(run, "ended_") or self.stamp(run, "alive_")
+        # A killed run may have stored captures after its last heartbeat, but perhaps not all that arrived.
+        for row in self.rows(
+            "SELECT last_utc_ns, last_monotonic_ns, last_boot_id FROM raw_chunks ORDER BY id DESC LIMIT 1"
+        ):
+            captured = self.stamp(row, "last_")
+            if captured.boot_id == last.boot_id and captured.monotonic_ns > last.monotonic_ns:
+                last = captured
+        return last
+
     def last_utc_ns(self) -> int:
         """Return the latest UTC that an earlier run of the daemon has stored, in ns; 0 for a new store."""
-        runs = "SELECT max(alive_utc_ns, coalesce(ended_utc_ns, 0)) AS utc_ns FROM daemon_runs ORDER BY id DESC LIMIT 1"
-        chunks = "SELECT last_utc_ns AS utc_ns FROM raw_chunks ORDER BY id DESC LIMIT 1"
         return self.unless_damaged(
-            lambda: max((row["utc_ns"] for sql in (runs, chunks) for row in self.rows(sql)), default=0), 0
+            lambda: max((self._end_of(run).utc_ns for run in self.rows(_NEWEST_RUN)), default=0), 0
         )
 
     def note_alive(self, until: Stamp) -> None:
