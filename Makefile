@@ -92,7 +92,7 @@ imports: environment
 
 # Some of every room, and nothing that starts a daemon. Where memory can hold files, no test waits for the disk.
 QUICK := tests/drivers tests/daemon/store tests/daemon/alarms tests/daemon/config tests/daemon/cli/lines \
-	tests/daemon/jobs/test_scheduler.py tests/daemon/web/test_access.py tests/daemon/report/test_front.py \
+	tests/daemon/jobs/test_scheduler.py tests/daemon/web/test_access.py tests/daemon/report/calibration/test_timing.py \
 	tests/calibration/numerics tests/calibration/rig tests/calibration/identification/test_start.py \
 	tests/calibration/gap/projected tests/simulators/devices
 IN_MEMORY := $(if $(wildcard /dev/shm),--basetemp /dev/shm/rigcal-quick-$(shell id -u))

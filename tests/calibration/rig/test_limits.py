@@ -107,6 +107,7 @@ def test_a_file_reads_the_same_on_any_turn_and_after_it_was_written_out(table: O
     assert data_sha256(again, RIG) == data_sha256(read, RIG)
 
 
+@pytest.mark.slow
 def test_a_model_of_readings_on_another_turn_has_commands_and_a_grid(
     model: CalibratedModel, table: Observations
 ) -> None:
@@ -123,6 +124,7 @@ def test_a_model_of_readings_on_another_turn_has_commands_and_a_grid(
     assert {name: (ends[0], ends[-1]) for name, ends in nodes.items()} == dict(model.coverage.ranges)
 
 
+@pytest.mark.slow
 def test_a_grid_of_a_joint_that_was_trained_beyond_its_limits_alone_is_refused(session: Session) -> None:
     ranges = dict(session.model.coverage.ranges) | {"theta7": (10.0, 150.0)}
     model = replace(session.model, coverage=replace(session.model.coverage, ranges=ranges))

@@ -112,6 +112,7 @@ def test_a_check_that_a_stop_ends_is_made_again(path: Path) -> None:
         assert results(path) == [None, "ok"]
 
 
+@pytest.mark.slow
 def test_a_long_check_ends_at_a_stop(path: Path) -> None:
     with watched(path, ends_in_order=False) as (store, _), store.transaction() as db:
         db.execute("CREATE TABLE long (n INTEGER PRIMARY KEY, text TEXT NOT NULL UNIQUE) STRICT")

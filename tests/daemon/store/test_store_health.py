@@ -150,6 +150,7 @@ def test_a_reader_that_wants_the_daemons_store_refuses_another_file_of_that_name
         Reader(path, ours)
 
 
+@pytest.mark.slow
 def test_a_job_does_not_work_on_a_store_that_took_the_place_of_the_daemons(tmp_path: Path) -> None:
     rig = JobRig(tmp_path)
     (tmp_path / "other").mkdir()
@@ -169,6 +170,7 @@ def test_a_job_does_not_work_on_a_store_that_took_the_place_of_the_daemons(tmp_p
         rig.close()
 
 
+@pytest.mark.slow
 def test_a_job_during_which_the_store_vanishes_waits_and_is_done_once_the_file_is_back(tmp_path: Path) -> None:
     rig = JobRig(tmp_path)
     path, aside = rig.config.store_path, tmp_path / "aside"

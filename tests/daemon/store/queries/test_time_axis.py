@@ -50,6 +50,7 @@ def first(rig: Rig) -> str:
     return controlled(rig)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seconds", [-HOUR_S, HOUR_S])
 def test_a_clock_that_is_set_between_sessions_does_not_move_the_later_one(rig: Rig, first: str, seconds: float) -> None:
     ended = present(rig)
