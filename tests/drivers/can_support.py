@@ -18,7 +18,7 @@ from pathlib import Path
 
 import can
 
-from drivers.can.ports import CanLinkConfig
+from drivers.can.ports import CanLinkConfig, Interface
 from drivers.can_link import CanLink
 from drivers.clock import Clock, Stamp, SystemClock
 from drivers.readings import CanCapture, DeviceEvent, EventKind, Gap, Reading, Record
@@ -144,6 +144,10 @@ def slcan_link(adapter: Adapter, clock: Clock | None = None, **settings: object)
 def _link(interface: str, channel: str, clock: Clock, settings: dict[str, object]) -> CanLink:
     of_link = {key: settings.pop(key) for key in ("setups", "configure_at_start") if key in settings}
     return CanLink(CanLinkConfig(name="boom", interface=interface, channel=channel, **settings), clock, **of_link)
+
+
+def adapter_config(interface: Interface, channel: str, options: dict[str, object]) -> CanLinkConfig:
+    return CanLinkConfig(name="boom", interface=interface, channel=channel, bitrate=250_000, options=options)
 
 
 @contextmanager
