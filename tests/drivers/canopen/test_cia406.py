@@ -202,6 +202,32 @@ def test_samples_that_nobody_read_in_time_are_no_jump(pieces: list[tuple[float, 
     assert read_late(encoder(max_rate_per_s=20.0), [(0.1, 0.0), *pieces, (0.2, 0.0)], queue) == []
 
 
+@given(st.lists(st.tuples(st.floats(0.0, 0.6), st.floats(0.0, 0.24)), max_size=12), st.floats(0.0001, 0.015))
+def test_a_reader_that_is_held_up_for_moments_makes_no_jump(held_up: list[tuple[float, float]], each_s: float) -> None:
+    """Also while it reads a backlog, of which each frame takes `each_s`."""
+    decoder = encoder(max_rate_per_s=20.0)
+    left = [
+        (0.2 + sum(there + away for there, away in held_up[:i]) + held_up[i][0], held_up[i][1])
+        for i in range(len(held_up))
+    ]
+    now = 0.0
+    for number in range(1, 300):
+        now = max(number * READ_EVERY, now + each_s)
+        for begin, length in left:
+            if begin <= now < begin + length:
+                now = begin + length
+        assert not jumps(decoder.decode(at(now), u32(round(number * READ_EVERY * FASTEST) % 65536)))
+
+
+@pytest.mark.parametrize("period_s", [0.01, 0.02, 0.05])
+def test_a_step_of_a_few_periods_of_fastest_motion_in_a_steady_series_is_a_jump(period_s: float) -> None:
+    decoder = encoder(max_rate_per_s=20.0)
+    for number in range(300):
+        assert not jumps(decoder.decode(at(number * period_s), u32(5000)))
+    step = round(3 * period_s * FASTEST)
+    assert jumps(decoder.decode(at(300 * period_s), u32(5000 + step)))
+
+
 def test_a_preset_is_told_again_once_a_backlog_must_be_read() -> None:
     decoder = encoder(max_rate_per_s=20.0)
     assert not read_late(decoder, [(1.0, 60.0)], 10)
