@@ -94,14 +94,14 @@ def raise_if_cancelled() -> None:
 
 
 @contextlib.contextmanager
-def acting_for(caller: Caller | None, is_cancelled: Callable[[], bool] = lambda: False) -> Iterator[None]:
+def acting_for(caller: Caller | None, is_cancelled: Callable[[], bool] | None = None) -> Iterator[None]:
     """Set the current caller of this thread.
 
     Args:
         caller: the caller; None for nobody.
-        is_cancelled: returns True once the caller has disconnected.
+        is_cancelled: returns True once the work is not wanted any more; None to keep the present one.
     """
-    token, left_token = _current.set(caller), _is_cancelled.set(is_cancelled)
+    token, left_token = _current.set(caller), _is_cancelled.set(is_cancelled or _is_cancelled.get())
     try:
         yield
     finally:

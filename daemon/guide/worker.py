@@ -194,7 +194,8 @@ class GuideWorker(WorkerThread):
         if opened is None or any(opened[key] != value for key, value in wanted.items()):
             if opened is not None and opened["note"] == wanted["note"]:  # the guide's own, for a prism skipped since
                 self._abort(opened["id"])
-            opened = self._sessions.start_command(wanted | {"operator": row.operator}, is_aimed=False)
+            with acting_for(row.caller):
+                opened = self._sessions.start_command(wanted | {"operator": row.operator}, is_aimed=False)
         # Otherwise the session was opened just before the daemon ended.
         with self._course.at_once():
             guide, now = self._course.record.opened(), self._sessions.open_session()

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from daemon.commands import Caller
 from daemon.store.connection import Connection
 from drivers.clock import Stamp
 
@@ -25,6 +26,7 @@ class GuideRow:
         state: open, finished or abandoned.
         setup_id: set-up of its station.
         operator: operator who is responsible.
+        caller: process that started it; None if its table is from before this was stored.
         request: its request.
         taps: number of commands given to it.
         started: when it was started.
@@ -34,6 +36,7 @@ class GuideRow:
     state: str
     setup_id: str
     operator: str
+    caller: Caller | None
     request: Mapping[str, Any]
     taps: int
     started: Stamp
@@ -87,8 +90,17 @@ class GuideTable:
         if not rows:
             return None
         row = rows[0]
-        request, started = json.loads(row["request_json"]), self._store.stamp(row, "started_")
-        return GuideRow(row["id"], row["state"], row["setup_id"], row["operator"], request, row["taps"], started)
+        caller = None if row["caller_uid"] is None else Caller(row["caller_user"], row["caller_uid"], row["caller_pid"])
+        return GuideRow(
+            row["id"],
+            row["state"],
+            row["setup_id"],
+            row["operator"],
+            caller,
+            json.loads(row["request_json"]),
+            row["taps"],
+            self._store.stamp(row, "started_"),
+        )
 
     def is_open(self) -> bool:
         """Return True if a guide is open."""

@@ -56,7 +56,7 @@ def at_a_pose(*warnings: str, boom: BoomPosition | None = None) -> dict[str, Any
         ("aimed", {}),
     ):
         job = job.after(kind, details)
-    row = GuideRow(1, "open", "S1", "Ada", {}, 3, Stamp(0, 0, "boot"))
+    row = GuideRow(1, "open", "S1", "Ada", None, {}, 3, Stamp(0, 0, "boot"))
     if boom is None:
         values = MIDDLE | {"theta1": 0.0}
         boom = BoomPosition(values, 30.0, None, is_fresh=False, missing="the joints were read 30 s ago")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import getpass
 import json
 import os
 import pty
@@ -147,6 +148,7 @@ def test_skipped_control_points_are_kept_and_the_session_is_not_used(daemon: Dae
     session = daemon.say("session.list")[-1]
     assert session["state"] == "closed"
     assert "control point" in session["not_used"]
+    assert (session["operator"], session["user"]) == ("Ada", getpass.getuser()), "of the process that started the guide"
     assert daemon.say("session.start", prism="r")["id"]  # the sessions are the operator's again
     daemon.say("session.abort")
 
