@@ -399,7 +399,7 @@ def check_setups(model: CalibratedModel, observations: Observations) -> None:
         blank = "" if unknown[0] else " (no setup in the row)"
         raise UnsafeError(
             f"set-up {unknown[0]!r}{blank} is unknown to the model (known: {known}); its base transform would be a "
-            f"guess. Use --refit-base to fit it on these fixes"
+            "guess. `rigcal evaluate --refit-base` fits it on fixes of that set-up"
         )
 
 

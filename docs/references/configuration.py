@@ -24,9 +24,9 @@ from drivers.stations.serial_port import SerialConfig
 _HEAD = """# Configuration
 
 Every key of the configuration file, which is `/etc/rigcal/rigcal.toml` for the installed service. The format is TOML.
-Unknown keys are errors, and relative paths are relative to the file's directory. `rigcal config check FILE` checks the
-file without opening a device, `rigcal init` writes an initial file, and [Connect bus and
-station](../how-to/connect.md) explains it step by step.
+Unknown keys are errors. Relative paths of files and directories are relative to the file's directory; ports and
+interfaces are used as they are written. `rigcal config check FILE` checks the file without opening a device,
+`rigcal init` writes an initial file, and [Connect bus and station](../how-to/connect.md) explains it step by step.
 
 This page is generated from the code: `python -m docs.references`.
 """
