@@ -115,12 +115,12 @@ class AlarmBoard(WokenThread):
         """Return the active alarms, critical ones first and then the oldest first, and the age of the last evaluation.
 
         Returns:
-            `active`: kind, subject, severity, text, remedy, since_utc_ns and age_s of each alarm; `looked_age_s`: time
-            since the last evaluation.
+            `active`: kind, subject, severity, text, remedy, since_utc_ns and age_s of each alarm; `looked_age_s`: real
+            seconds since the last evaluation.
         """
         now = self._clock.now()
         with self._turn:
-            active, looked_age_s = list(self._active.values()), now.since(self._looked) / NS_PER_S
+            active, looked = list(self._active.values()), self._looked
         active.sort(key=lambda one: (one.alarm.severity != "critical", -now.since(one.raised)))
         shown = [
             {
@@ -130,7 +130,7 @@ class AlarmBoard(WokenThread):
             }
             for one in active
         ]
-        return {"active": shown, "looked_age_s": looked_age_s}
+        return {"active": shown, "looked_age_s": self._clock.real_seconds(now.since(looked) / NS_PER_S)}
 
     def list_command(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
         """Return the active alarms as `status` does; with `all` also the newest cleared ones, newest first."""

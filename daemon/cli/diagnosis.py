@@ -15,6 +15,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from daemon.cli.lines.state import LATE, channel_status
 from drivers.can.bus_options import slcan_port
 from drivers.readings import GapReason
 
@@ -339,13 +340,15 @@ def _channels(channels: list[Mapping[str, Any]]) -> Iterator[Finding]:
     groups: dict[tuple[str, str], list[str]] = {}
     for channel in channels:
         if channel["status"] != "ok":
-            since = "never heard" if channel["age_s"] is None else channel["status"].replace("_", " ")
+            since = "never heard" if channel["age_s"] is None else channel_status(channel)
             groups.setdefault((channel["kind"], since), []).append(channel["name"])
     if channels and not groups:
         yield Finding("channels", "good", f"all {len(channels)} joints and signals are read")
     for (kind, since), names in groups.items():
         state: State = "fault" if kind == "joint" else "warning"
         remedy = "check power and cable; `rigcal status --frames` shows which identifiers are received"
+        if since == LATE:
+            remedy = "the computer does not keep up with decoding: `top` shows what is busy"
         yield Finding(f"{kind}s", state, f"{since}: {', '.join(names)}", remedy)
 
 

@@ -14,6 +14,7 @@ from daemon.cli.command import Command
 from daemon.cli.lines.clock import clock_sentence, latency_sentence
 from daemon.cli.lines.jobs import job_line
 from daemon.cli.lines.state import (
+    channel_status,
     decoding_lines,
     gap_lines,
     gap_state_lines,
@@ -99,7 +100,7 @@ def _show_channels(channels: Sequence[Mapping[str, Any]]) -> None:
         [
             channel["name"],
             "" if channel["value"] is None else f"{channel['value']:.3f} {channel['unit']}",
-            Coloured(channel["status"].replace("_", " "), "green" if channel["status"] == "ok" else "red"),
+            Coloured(channel_status(channel), "green" if channel["status"] == "ok" else "red"),
             "never" if channel["age_s"] is None else f"{channel['age_s']:.1f}",
         ]
         for channel in channels

@@ -11,6 +11,7 @@ from daemon.cli.terminal import echo
 from daemon.host.safe_output import duration
 from daemon.report.words import not_used, number
 
+LATE = "late, not yet decoded"
 _NAMES_SHOWN = 6  # in one line
 _EXPERIMENTS_SHOWN = 3
 _ALARMS_OLD_S = 30.0  # they are evaluated every second
@@ -71,6 +72,13 @@ def gap_state_lines(acquisition: Mapping[str, Any]) -> Iterator[str]:
         more = f" and {len(names) - _NAMES_SHOWN} more" if len(names) > _NAMES_SHOWN else ""
         age = duration(gaps[0]["age_s"])  # the longest comes first
         yield f"gap: {reason.replace('_', ' ')} for {age}: {', '.join(names[:_NAMES_SHOWN])}{more}"
+
+
+def channel_status(channel: Mapping[str, Any]) -> str:
+    """Return the status of a joint or signal in words. One whose readings wait to be decoded is late, not silent."""
+    if channel["status"] == "silent" and not channel["is_silent"]:
+        return LATE
+    return str(channel["status"]).replace("_", " ")
 
 
 def station_line(station: Mapping[str, Any]) -> str:

@@ -11,7 +11,15 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from daemon.cli.lines.jobs import job_line
-from daemon.cli.lines.state import alarm_line, decoding_lines, gap_state_lines, model_lines, notice_lines, store_lines
+from daemon.cli.lines.state import (
+    alarm_line,
+    channel_status,
+    decoding_lines,
+    gap_state_lines,
+    model_lines,
+    notice_lines,
+    store_lines,
+)
 from daemon.host.safe_output import duration, shown
 from daemon.next_step import next_line
 from daemon.report.words import number
@@ -150,7 +158,7 @@ def _channels(channels: Sequence[Mapping[str, Any]]) -> str:
     bad: dict[str, list[str]] = {}
     for channel in channels:
         if channel["status"] != "ok":
-            bad.setdefault(channel["status"].replace("_", " "), []).append(channel["name"])
+            bad.setdefault(channel_status(channel), []).append(channel["name"])
     faults = [f"{status}: {_some(names)}" for status, names in bad.items()]
     return "; ".join([", ".join(told), *faults])
 

@@ -59,6 +59,7 @@ def status(**changes: Any) -> dict[str, Any]:
             "status": "ok",
             "value": 12.5,
             "age_s": 0.1,
+            "is_silent": False,
             "link": "boom",
         }
         for n in range(9)
@@ -165,6 +166,13 @@ def test_failed_decodes_and_jobs_push_nothing_out() -> None:
     assert "and 7 more: `rigcal status --all` shows all" in text
     assert "and 5 more: `rigcal jobs list` shows all" in text
     assert "more lines" not in text
+
+
+def test_a_joint_whose_readings_wait_to_be_decoded_is_late_and_not_silent() -> None:
+    joints = [dict(joint, status="silent", age_s=9.0) for joint in acquired()["channels"]]
+    assert "late, not yet decoded: theta0" in screen(status(acquisition=acquired(channels=joints)))
+    text = screen(status(acquisition=acquired(channels=[dict(joint, is_silent=True) for joint in joints])))
+    assert "silent: theta0" in text
 
 
 def test_a_job_that_runs_is_told_before_those_that_wait() -> None:
