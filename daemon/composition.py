@@ -272,7 +272,7 @@ def _aim(simulation: SimulatedRig, target: str) -> None:
 def _visit(simulation: SimulatedRig, rig: Rig, dwell_s: float, rows: Sequence[Mapping[str, Any]]) -> int:
     try:
         return simulation.visit(stops_of(rig, rows, dwell_s))
-    except ValueError as error:
+    except (SimulationError, ValueError) as error:
         raise CommandError(str(error)) from error
 
 

@@ -119,7 +119,13 @@ class SimulatedRig:
         return list(self._do("poses", "poses", n=number, seed=seed)["poses"])
 
     def visit(self, stops: Iterable[Stop]) -> int:
-        """Add poses to drive to next, in this order, and return how many are left to visit."""
+        """Add poses to drive to next, in this order, and return how many are left to visit.
+
+        Raises:
+            SimulationError: the process has ended.
+        """
+        if self.has_ended():
+            raise SimulationError(_ENDED)
         self._stops.extend(stops)
         return len(self._stops)
 

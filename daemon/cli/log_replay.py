@@ -93,18 +93,25 @@ def replay_logs(
 
 
 def _event_of(state: DeviceState) -> DeviceEvent:
-    return DeviceEvent(state.device, Stamp(state.utc_ns, state.utc_ns, BOOT_ID), state.kind, state.text, state.code)
+    return DeviceEvent(state.device, _instant(state.utc_ns), state.kind, state.text, state.code)
+
+
+def _instant(utc_ns: int) -> Stamp:
+    return Stamp(utc_ns, utc_ns, BOOT_ID)
 
 
 def _commands_of(told: SessionFile, sessions: SessionManager, begin_ns: int) -> Commands:
     """Return the operator's commands of a session in the order of time."""
     start = {"id": REPLAYED, "prism": told.prism, "kind": told.kind, "operator": "replay"}
     confirm = partial(sessions.confirm_prism_command, {"operator": "replay"})
+    away = [(_instant(since_ns), _instant(until_ns)) for since_ns, until_ns in told.away_utc_ns or ()]
+    begin_ns = told.since_utc_ns or begin_ns
     between = [(at_ns, confirm) for at_ns in told.prism_confirmed_utc_ns]
     between += [(at_ns, partial(sessions.turned_command, {})) for at_ns in told.prism_turned_utc_ns]
     return Commands(
         [
-            (told.since_utc_ns or begin_ns, partial(sessions.start_command, start)),
+            (begin_ns, partial(sessions.start_command, start)),
+            (begin_ns, partial(sessions.was_away, lambda _: away)),
             *sorted(between, key=lambda command: command[0]),
             (told.until_utc_ns, partial(sessions.stop_command, {})),
         ]
@@ -116,7 +123,7 @@ def _followed(captures: Iterable[Capture], clock: ManualClock, commands: Command
     for capture in captures:
         while commands and commands[0][0] <= capture.stamp.monotonic_ns:
             at_ns, command = commands.popleft()
-            clock.set(Stamp(at_ns, at_ns, BOOT_ID))
+            clock.set(_instant(at_ns))
             command()
         clock.set(capture.stamp)
         yield capture

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from typing import Any
@@ -19,13 +19,14 @@ from daemon.guide.advisor import Advisor
 from daemon.guide.job import Job, Pose
 from daemon.guide.meter_link import Place
 from daemon.guide.position import PositionWatch
-from daemon.guide.record import GuideRecord, GuideStep, is_on_prism
+from daemon.guide.record import GuideRecord, GuideStep
+from daemon.guide.times_away import is_on_prism, times_away
 from daemon.sessions.manager import SessionManager
 from daemon.store.queries.guides import Standstill
 from daemon.store.queries.sessions import SessionTable
 from daemon.store.queries.setups import control_points
 from daemon.store.store import Store
-from drivers.clock import Clock
+from drivers.clock import Clock, Stamp
 
 log = logging.getLogger(__name__)
 
@@ -89,14 +90,15 @@ class Course:
             log.warning("guide %d is abandoned: %s", guide[0].id, _WITHOUT_SESSION)
             self.abandon(_WITHOUT_SESSION)
         # Fixes that were captured but not decoded yet must not count if the station was on no prism.
-        away = [*self.record.times_away()]
-        guide = self.record.opened()
-        if guide is not None and not guide[1].run.session:  # the last run may have just opened one
-            away.append((guide[0].started, None))
-        if away:
-            self._sessions.was_away(away)
+        self._sessions.was_away(self._times_away)
         if self.record.is_open:
             self.start_advisor()
+
+    def _times_away(self, session_id: str) -> Sequence[tuple[Stamp, Stamp | None]]:
+        guide, opened = self.record.opened(), self._sessions.open_session()
+        if guide is not None and not guide[1].run.session and opened is not None and opened["id"] == session_id:
+            return [(guide[0].started, None)]  # the last run opened it, and ended before it could store so
+        return [*times_away(self._store, session_id)]
 
     def _is_without_session(self, job: Job) -> bool:
         """Return True if the session of the current run ended before the last step, in which the daemon closes it."""

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
 from daemon.commands import REFUSED, CommandError, caller_columns
 from daemon.guide.job import Job, Request
 from daemon.guide.view import headline
-from daemon.store.queries.guides import EventRow, GuideRow, GuideTable
+from daemon.store.queries.guides import GuideRow, GuideTable
 from daemon.store.store import Store
-from drivers.clock import Clock, Stamp
+from drivers.clock import Clock
 
 log = logging.getLogger(__name__)
 
@@ -133,33 +133,3 @@ class GuideRecord:
         self.row, self.job, self.taps = row, job, row.taps
         if job.state == "open":
             log.warning("guide %d was open when rigcal last ended; it continues: %s", row.id, headline(job))
-
-    def times_away(self) -> Iterator[tuple[Stamp, Stamp | None]]:
-        """Yield start and end of each time of the session with the station on no prism; the end is None if it lasts."""
-        opened = self.opened()
-        if opened is None or not opened[1].run.session:
-            return
-        row, job = opened
-        away: Stamp | None = None
-        state = Job.of(job.request)
-        for event in self.table.events(row.id):
-            was_on_prism = is_on_prism(state)
-            state = state.after(event.kind, event.details)
-            if state.at != job.at:
-                continue
-            if _turns_away(event, was_on_prism, state):
-                away = event.at
-            elif event.kind == "aimed" and away is not None:
-                yield away, event.at
-                away = None
-        if away is not None:
-            yield away, None
-
-
-def is_on_prism(job: Job) -> bool:
-    """Return True while the station is on the prism of the session."""
-    return job.step is not None and job.step.kind == "poses"
-
-
-def _turns_away(event: EventRow, was_on_prism: bool, after: Job) -> bool:
-    return event.kind == "opened" or (was_on_prism and not is_on_prism(after))

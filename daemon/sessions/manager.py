@@ -302,16 +302,18 @@ class SessionManager:
         if session is not None:
             session.shots.append(Shot(0, self._clock.now()))
 
-    def was_away(self, times: Iterable[tuple[Stamp, Stamp | None]]) -> None:
-        """Exclude fixes of the open session, and judge its prism again, after an earlier run of the daemon.
+    def was_away(self, times: Callable[[str], Iterable[tuple[Stamp, Stamp | None]]]) -> None:
+        """Exclude fixes that are decoded from now on and were measured at times when the station was on no prism.
 
         Args:
-            times: when the station was turned away from the prism, and when it was back; None where it is not yet.
+            times: returns for a session when the station was turned away from its prism, and when it was back; None
+                if it was not back by the session's end, or is not yet.
         """
-        session = self._open
-        if session is not None:
-            session.shots += [Shot(0, since, until) for since, until in times]
-            self._prisms.restore(session)
+        for session in self._taking():
+            away = [Shot(0, since, until) for since, until in times(session.id)]
+            if away:
+                session.shots += away
+                self._prisms.restore(session)
 
     def look_back(self, operator: str) -> None:
         """Use the fixes of the open session again, after an operator has confirmed that the station is on its prism."""

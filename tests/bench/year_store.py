@@ -25,6 +25,7 @@ from daemon.commands import CommandError
 from daemon.composition import decoders
 from daemon.config.config import parse_config
 from daemon.control.protocol import request
+from daemon.guide.times_away import times_away
 from daemon.rig_files import load_rig
 from daemon.service import declare_channels
 from daemon.sessions.export.captured_logs import export_session
@@ -226,7 +227,11 @@ def measure(directory: Path, path: Path) -> bool:
         bars.took("all captures of 8 minutes", None, _captures, reader, since, until)
     config = parse_config(CONFIG, path).model_copy(update={"state_directory": directory})
     with tempfile.TemporaryDirectory() as out:
-        bars.note("session export of 8 minutes", _seconds(export_session, config, names[0], Path(out), "log"), None)
+        bars.note(
+            "session export of 8 minutes",
+            _seconds(export_session, config, names[0], Path(out), "log", times_away),
+            None,
+        )
     return bars.are_held
 
 

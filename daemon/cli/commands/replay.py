@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 from typing import Any
 
 import click
 
 from daemon.cli.command import Command, json_option
-from daemon.cli.terminal import echo
+from daemon.cli.terminal import echo, echo_error
 from daemon.commands import SESSION_KINDS
 from daemon.host.safe_output import write_file
 
 COUNTED = ("joint_samples", "signals", "fixes", "device_events", "decode_failures", "gaps", "observations")
+_OF_EARLIER_VERSION = (
+    "the file is of an earlier version, which did not write when the station was on no prism: if the session was "
+    "guided, fixes of another prism from those times may be used; export the session again"
+)
 
 
 @click.command(cls=Command)
@@ -72,6 +77,8 @@ def replay(
     if prism is not None and session_file is not None:
         raise click.UsageError("give --prism or --session, not both")
     told = None if session_file is None else read_session_file(session_file)
+    if told is not None and told.away_utc_ns is None:
+        echo_error(f"Warning: {session_file}: {_OF_EARLIER_VERSION}", logging.WARNING)
     if prism is not None:
         told = whole_session(prism, kind)
     session = replay_logs(files, settings, source, path, told)

@@ -166,6 +166,7 @@ def session_export(name: str, config: Path, out: Path, form: Any, *, as_json: bo
     The other formats: the observations, all joint readings and all fixes as tables.
     """
     from daemon.config.config import read_config
+    from daemon.guide.times_away import times_away
     from daemon.sessions.export.captured_logs import export_session
     from daemon.sessions.export.tables import export_tables
 
@@ -173,7 +174,7 @@ def session_export(name: str, config: Path, out: Path, form: Any, *, as_json: bo
     if form in _TABLE_FORMATS:
         files = export_tables(settings.store_path, name, out, _TABLE_FORMATS[form])
     else:
-        files = export_session(settings, name, out, "log" if form == "candump" else form)
+        files = export_session(settings, name, out, "log" if form == "candump" else form, times_away)
     if not as_json:
         for file in files:
             echo(file)

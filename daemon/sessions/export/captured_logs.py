@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -28,13 +28,17 @@ from drivers.logs.serial_log import SerialLogHeader, SerialLogWriter
 from drivers.readings import CanCapture, Capture, SerialCapture
 
 CanFormat = Literal["log", "asc", "blf"]
+Away = tuple[Stamp, Stamp | None]
+TimesAway = Callable[[Reader, str], Iterable[Away]]
 
 JOINED_WITHIN_S = 5.0  # after the session's end, if links are alive; a killed daemon joins no more fixes
 LOOK_S = 0.1
 _BETWEEN_BOOTS_NS = 1_000_000  # smallest distance of boots: logs have microseconds, and the order must be kept
 
 
-def export_session(config: Config, session_id: str, out: Path, can_format: CanFormat) -> list[Path]:
+def export_session(
+    config: Config, session_id: str, out: Path, can_format: CanFormat, times_away: TimesAway
+) -> list[Path]:
     """Write a session's captures, one file per link, the operator's commands, and its observations.
 
     Logs contain UTC only, so steps of the computer's clock are removed from it: otherwise captures recorded around a
@@ -45,6 +49,8 @@ def export_session(config: Config, session_id: str, out: Path, can_format: CanFo
         session_id: a session that has ended.
         out: directory, created if needed.
         can_format: format of the CAN logs: candump `log`, Vector `asc` or `blf`.
+        times_away: returns when the station was turned away from the session's prism, and when it was back; None if it
+            was not back by the session's end.
 
     Returns:
         The files, `<session>-<link>.<format>`, `<session>-<station>.serial`, `<session>.json` and `<session>.csv`.
@@ -58,11 +64,14 @@ def export_session(config: Config, session_id: str, out: Path, can_format: CanFo
         out.mkdir(parents=True, exist_ok=True)
         # A damaged store must not leave an incomplete log that looks complete
         with tempfile.TemporaryDirectory(prefix=f".{session_id}.", dir=out) as scratch:
-            files = _write(reader, config, found, Path(scratch), can_format)
+            away = [*times_away(reader, session_id)]
+            files = _write(reader, config, found, Path(scratch), can_format, away)
             return [file.replace(out / file.name) for file in files]
 
 
-def _write(reader: Reader, config: Config, found: Mapping[str, Any], out: Path, can_format: CanFormat) -> list[Path]:
+def _write(
+    reader: Reader, config: Config, found: Mapping[str, Any], out: Path, can_format: CanFormat, away: Sequence[Away]
+) -> list[Path]:
     session_id = found["id"]
     started, ended = reader.stamp(found, "started_"), reader.stamp(found, "ended_")
     since, until = started.shifted(-BEFORE_NS), ended.shifted(AFTER_NS)
@@ -102,6 +111,7 @@ def _write(reader: Reader, config: Config, found: Mapping[str, Any], out: Path, 
         until_utc_ns=steady.of(ended).utc_ns,
         prism_confirmed_utc_ns=tuple(at_ns for turning, at_ns in words if not turning),
         prism_turned_utc_ns=tuple(at_ns for turning, at_ns in words if turning),
+        away_utc_ns=tuple((steady.of(left).utc_ns, steady.of(back or ended).utc_ns) for left, back in away),
         control_points={
             point["name"]: (point["x_mm"], point["y_mm"], point["z_mm"])
             for point in control_points(reader, found["setup_id"])

@@ -58,6 +58,8 @@ class SessionFile(BaseModel):
         since_utc_ns, until_utc_ns: start and end of the session.
         prism_confirmed_utc_ns: when an operator confirmed that the station was on the prism.
         prism_turned_utc_ns: when a program turned the station to the prism.
+        away_utc_ns: start and end of each time at which the station was on no prism, as a guide knew; None in files of
+            earlier versions, which do not contain it.
         control_points: name -> place, mm, of the control points of its set-up; fixes there are not of the prism.
         doubtful: link -> its captures of doubtful time; links without such captures are left out.
         can_channels: CAN link -> its channel number, from 1, in logs without channel names; empty in files of earlier
@@ -74,6 +76,7 @@ class SessionFile(BaseModel):
     control_points: dict[str, tuple[float, float, float]]
     prism_confirmed_utc_ns: tuple[int, ...] = ()
     prism_turned_utc_ns: tuple[int, ...] = ()
+    away_utc_ns: tuple[tuple[int, int], ...] | None = None
     doubtful: dict[str, DoubtfulCaptures] = Field(default_factory=dict)
     can_channels: dict[str, int] = Field(default_factory=dict)
     device_states: tuple[DeviceState, ...] = ()

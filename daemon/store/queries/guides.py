@@ -9,12 +9,15 @@ from typing import Any
 
 from daemon.commands import Caller
 from daemon.store.connection import Connection
+from daemon.store.reader import Reader
 from drivers.clock import Stamp
 
 # The newest standstill with used observations. Runs ten times a second, so it searches by number, not all rows.
 _STANDSTILL = """SELECT pose, count(*) AS fixes, max(id) AS last FROM observations NOT INDEXED
     WHERE session_id = ? AND id > ? AND excluded IS NULL AND pose IS NOT NULL
     GROUP BY pose ORDER BY last DESC LIMIT 1"""
+_REQUEST = """SELECT guides.id, request_json FROM guide_events JOIN guides ON guides.id = guide_id
+    WHERE kind = 'opened' AND json_extract(details_json, '$.session') = ?"""
 
 
 @dataclass(frozen=True)
@@ -133,8 +136,7 @@ class GuideTable:
 
     def events(self, guide_id: int) -> list[EventRow]:
         """Return all events of a guide, oldest first."""
-        rows = self._store.rows("SELECT * FROM guide_events WHERE guide_id = ? ORDER BY id", (guide_id,))
-        return [EventRow(row["kind"], json.loads(row["details_json"]), self._store.stamp(row)) for row in rows]
+        return guide_events(self._store, guide_id)
 
     def newest_observation(self) -> int:
         """Return the number of the store's newest observation; 0 before the first."""
@@ -147,3 +149,18 @@ class GuideTable:
             return None
         (values,) = self._store.rows("SELECT values_json FROM observations WHERE id = ?", (rows[0]["last"],))
         return Standstill(**rows[0], values=json.loads(values["values_json"]))
+
+
+# ---- for the writing connection and for readers ----------------------------------------------------------------------
+
+
+def guide_events(source: Connection | Reader, guide_id: int) -> list[EventRow]:
+    """Return all events of a guide, oldest first."""
+    rows = source.rows("SELECT * FROM guide_events WHERE guide_id = ? ORDER BY id", (guide_id,))
+    return [EventRow(row["kind"], json.loads(row["details_json"]), source.stamp(row)) for row in rows]
+
+
+def guide_request(source: Connection | Reader, session_id: str) -> tuple[int, Mapping[str, Any]] | None:
+    """Return number and request of the guide that held a session; None if it was not guided."""
+    rows = source.rows(_REQUEST, (session_id,))
+    return next(((row["id"], json.loads(row["request_json"])) for row in rows), None)

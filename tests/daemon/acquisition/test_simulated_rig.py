@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import uuid
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -20,10 +21,10 @@ def test_a_simulated_rig_whose_process_has_died_says_how_to_start_it_again(tmp_p
         simulation._process.kill()
         simulation._process.wait()
         assert simulation.has_ended()
-        for _ in range(2):
+        for ask in (partial(simulation.aim, "r"), partial(simulation.aim, "r"), partial(simulation.visit, [])):
             with pytest.raises(
                 SimulationError, match=r"^the simulated rig has ended; .* start both again with `rigcal run --sim`"
             ):
-                simulation.aim("r")
+                ask()
     finally:
         simulation.close()

@@ -15,6 +15,7 @@ from daemon.cli.main import main
 from daemon.commands import CommandError
 from daemon.config.config import parse_config
 from daemon.config.sections import SessionsSection
+from daemon.guide.times_away import times_away
 from daemon.sessions.export.captured_logs import export_session
 from daemon.sessions.export.session_file import SessionFile, read_session_file
 from daemon.sessions.manager import SessionManager
@@ -320,8 +321,9 @@ def test_what_operators_confirmed_is_exported_with_the_session(rig: Rig, tmp_pat
     confirmed_ns = rig.clock.now().utc_ns
     rig.live(2)
     rig.say("stop")
+    rig.store.end_run(rig.clock.now())
     config = parse_config(CONFIG, tmp_path / "rigcal.toml")
-    export_session(config, "s1", tmp_path / "out", "log")
+    export_session(config, "s1", tmp_path / "out", "log", times_away)
     assert read_session_file(tmp_path / "out" / "s1.json").prism_confirmed_utc_ns == (confirmed_ns,)
 
 
@@ -371,6 +373,30 @@ def test_in_a_simulated_rig_prism_b_never_becomes_prism_r(recorded: Path, tmp_pa
     assert min(counting) < JUMP_S
     assert max(counting) > BACK_S + 5
     assert [s for s in counting if JUMP_S + 1 < s < BACK_S] == []
+
+
+def test_a_replay_uses_no_fix_from_the_times_when_a_guide_knew_that_the_station_was_on_no_prism(
+    recorded: Path, tmp_path: Path
+) -> None:
+    begin_ns, second_ns = ManualClock().now().utc_ns, 10**9
+    on_b, on_r = (JUMP_S + 1) * second_ns, (BACK_S + 1) * second_ns
+    told = SessionFile(
+        prism="r",
+        kind="static_poses",
+        since_utc_ns=begin_ns + on_b,  # the station holds b at two poses, and only then is aimed at r
+        until_utc_ns=begin_ns + END_S * second_ns,
+        control_points={},
+        prism_confirmed_utc_ns=(begin_ns + on_r,),
+        away_utc_ns=(
+            (begin_ns + on_b, begin_ns + on_r),
+            (begin_ns + (END_S - 2) * second_ns, begin_ns + END_S * 10**9),
+        ),
+    )
+    (tmp_path / "s.json").write_text(told.model_dump_json(), encoding="utf-8")
+    rows = replayed(recorded, tmp_path / "s.sqlite", "--session", tmp_path / "s.json")
+    assert {row["excluded"] for row in rows} == {None}
+    assert BACK_S + 1 <= rows[0]["second"] < BACK_S + 2
+    assert END_S - 3 < rows[-1]["second"] <= END_S - 2
 
 
 def test_a_replay_honours_what_the_operator_confirmed(recorded: Path, tmp_path: Path) -> None:

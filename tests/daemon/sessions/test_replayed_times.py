@@ -45,15 +45,22 @@ def beside_the_station(log: Path) -> Path:
     return log
 
 
-def replayed(directory: Path, log: Path, **changes: int) -> Result:
+def replayed(
+    directory: Path, log: Path, away_utc_ns: tuple[tuple[int, int], ...] | None = (), **changes: int
+) -> Result:
     """What a replay of a log and the station's says, with the session of their time."""
     config, told = directory / "rigcal.toml", directory / "told.json"
     config.write_text(CONFIG.format(profile="passive", options=""), encoding="utf-8")
     since_ns, until_ns = changes.get("since_ns", FIRST_NS + NS_PER_S), changes.get("until_ns", LAST_NS)
     session = SessionFile(
-        prism="r", kind="static_poses", since_utc_ns=since_ns, until_utc_ns=until_ns, control_points={}
+        prism="r",
+        kind="static_poses",
+        since_utc_ns=since_ns,
+        until_utc_ns=until_ns,
+        control_points={},
+        away_utc_ns=away_utc_ns,
     )
-    told.write_text(session.model_dump_json(), encoding="utf-8")
+    told.write_text(session.model_dump_json(exclude_defaults=True), encoding="utf-8")
     arguments = ["replay", log, log.with_name("station.serial"), "--session", told, "--config", config]
     return CliRunner().invoke(main, [*map(str, arguments), "--store", str(directory / "new.sqlite")])
 
@@ -123,3 +130,15 @@ def test_a_replay_tells_how_many_observations_can_be_used_and_why_others_cannot(
     unusable = sum(n for what, n in number.items() if what.startswith("cannot be used: "))
     assert 0 < number["of these observations can be used"] < number["observations"]
     assert number["of these observations can be used"] + unusable == number["observations"]
+
+
+def test_a_replay_with_a_session_file_of_an_earlier_version_tells_once_that_it_may_use_another_prism_s_fixes(
+    tmp_path: Path,
+) -> None:
+    log = STANDING / "boom.log"
+    assert replayed(tmp_path, log).stderr == ""
+    (tmp_path / "new.sqlite").unlink()
+    result = replayed(tmp_path, log, away_utc_ns=None)
+    assert result.exit_code == 0
+    assert "away_utc_ns" not in (tmp_path / "told.json").read_text(encoding="utf-8")
+    assert result.stderr.count("fixes of another prism from those times may be used; export the session again") == 1

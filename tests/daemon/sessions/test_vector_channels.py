@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from daemon.config.config import Config, ConfigError, read_config
+from daemon.guide.times_away import times_away
 from daemon.sessions.export.captured_logs import CanFormat, export_session
 from daemon.sessions.export.session_file import DoubtfulCaptures, SessionFile, read_session_file
 from daemon.sessions.replay import captures_of, first_captures
@@ -55,7 +56,7 @@ def exported(directory: Path, config: Config, can_format: CanFormat, links: Sequ
     rig.say("stop")
     rig.store.end_run(rig.clock.now())
     rig.store.close()
-    export_session(config, "s001-r", directory / "out", can_format)
+    export_session(config, "s001-r", directory / "out", can_format, times_away)
     return {link: directory / "out" / f"s001-r-{link}.{can_format}" for link in links}
 
 

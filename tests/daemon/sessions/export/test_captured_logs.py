@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from daemon.config.config import parse_config
+from daemon.guide.times_away import times_away
 from daemon.sessions.export.captured_logs import CanFormat, export_session
 from daemon.sessions.export.session_file import read_session_file
 from daemon.sessions.replay import merged
@@ -79,7 +80,9 @@ def test_a_link_that_fell_silent_before_a_reboot_comes_beside_the_others_of_the_
         rig.store.mark_decoded([*rig.store.append_captures(frames), *rig.store.append_captures(lines)])
     rig.clock.set(at_second(END_S, behind_s))
     close(rig)
-    logs = [path for path in export_session(config, "s1", tmp_path / "out", can_format) if path.suffix != ".csv"]
+    logs = [
+        path for path in export_session(config, "s1", tmp_path / "out", can_format, times_away) if path.suffix != ".csv"
+    ]
     told = read_session_file(logs.pop())
     came: dict[str, list[int]] = {"boom": [], "ts": []}
     apart = []
@@ -102,5 +105,5 @@ def test_a_damaged_store_leaves_no_part_of_a_session_s_logs(tmp_path: Path) -> N
     rig.store.update("raw_chunks", {"id": chunk}, {"chunk": b"rust"})
     close(rig)
     with pytest.raises(StoreError, match=f"raw chunk {chunk}"):
-        export_session(config, "s1", tmp_path / "out", "log")
+        export_session(config, "s1", tmp_path / "out", "log", times_away)
     assert [*(tmp_path / "out").iterdir()] == []
