@@ -87,8 +87,8 @@ def joint_inputs(rig: Rig) -> list[JointInput]:
 
 
 def signal_inputs(rig: Rig) -> list[SignalInput]:
-    """Return the signals of a rig: its channels that are not joints."""
-    return [SignalInput(c.name, c.column) for c in rig.channels if c.name not in rig.joint_names]
+    """Return the signals of a rig: its channels that are not joints. A value is used until its channel is silent."""
+    return [SignalInput(c.name, c.column, c.timeout_s) for c in rig.channels if c.name not in rig.joint_names]
 
 
 class ObservationJoiner:

@@ -56,7 +56,7 @@ class SignalInput:
 
     name: str
     column: str
-    max_age_s: float = 5.0
+    max_age_s: float
 
 
 @dataclass(frozen=True, slots=True)

@@ -221,7 +221,7 @@ def test_fixes_that_are_not_ok_are_passed_over() -> None:
 
 
 def test_another_boot_ends_what_was_pending_and_begins_anew() -> None:
-    joiner = ObservationJoiner([THETA], [SignalInput("valve", "valve_mA")])
+    joiner = ObservationJoiner([THETA], [SignalInput("valve", "valve_mA", 5.0)])
     late = Reading("theta1", at(0.5, "boot-b"), 1.0, "deg")
     (joined,) = joiner.feed([*samples(1.0, 5.0), reading("valve", 0.5, 3.0, "mA"), fix(0.99), late])
     assert joined.refused == "theta1: no sample after the fix"
@@ -246,7 +246,7 @@ def test_records_of_other_kinds_and_channels_do_not_matter() -> None:
 
 
 def test_an_older_sample_that_comes_late_is_left_out() -> None:
-    joiner = ObservationJoiner([THETA], [SignalInput("valve", "valve_mA")])
+    joiner = ObservationJoiner([THETA], [SignalInput("valve", "valve_mA", 5.0)])
     joiner.feed([*samples(1.5, 5.0), reading("valve", 0.5, 3.0, "mA")])
     (joined,) = joiner.feed([reading("theta1", 0.9, 99.0), reading("valve", 0.2, 9.0, "mA"), fix(0.9)])
     assert joined.values["theta1_deg"] == 5.0
@@ -333,7 +333,7 @@ def test_a_long_standstill_is_remembered_by_a_late_fix() -> None:
 
 def test_signals_are_the_latest_before_the_fix() -> None:
     records = [*samples(3.0), *(reading("valve", t / 2, float(t), "mA") for t in range(6)), fix(1.25)]
-    (joined,) = join(records, THETA, signals=[SignalInput("valve", "valve_mA")])
+    (joined,) = join(records, THETA, signals=[SignalInput("valve", "valve_mA", 5.0)])
     assert joined.values["valve_mA"] == 2.0
 
 
@@ -408,7 +408,21 @@ def test_readings_of_doubtful_time_do_not_keep_a_standing_joint_from_being_joine
 
 
 def test_a_signal_of_doubtful_time_leaves_the_value_before_it() -> None:
-    joiner = ObservationJoiner((THETA,), (SignalInput("pump", "pump_bar"),))
+    joiner = ObservationJoiner((THETA,), (SignalInput("pump", "pump_bar", 5.0),))
     records: list[Record] = [reading("pump", 0.5, 120.0, "bar"), late(0.9, "pump", "bar")]
     (joined,) = joiner.feed([*samples(2.0), *records, fix(1.0)])
     assert joined.values["pump_bar"] == 120.0
+def test_a_signal_is_joined_until_its_channel_counts_as_silent() -> None:
+    rig = shipped_rig("swdt82")
+    of_name = {channel.name: channel for channel in rig.channels}
+    slow, quick = of_name["temperature"].model_copy(update={"timeout_s": 30.0}), of_name["boom_pressure"]
+    inputs = signal_inputs(rig.model_copy(update={"channels": (slow, quick)}))
+    sent: list[Record] = [reading(slow.name, float(t), 20.0, slow.unit) for t in range(0, 31, 10)]
+    sent += [reading(quick.name, t / 10, 100.0, quick.unit) for t in range(100)]
+    fixes = [fix(t / 4) for t in range(4, 160)]
+    joined = join([*samples(45.0, 5.0), *sent, *fixes], THETA, signals=inputs)
+    assert all(slow.column in j.values for j in joined), "a value every 10 s is not old"
+    last_s = max(j.stamp.since(at(0.0)) / 1e9 for j in joined if quick.column in j.values)
+    assert last_s == pytest.approx(9.9 + 1.0, abs=0.2), "it was last read at 9.9 s"
+
+
