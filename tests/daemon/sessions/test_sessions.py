@@ -65,6 +65,22 @@ def test_observations_leave_as_the_contracts_csv_and_can_be_read_as_one(rig: Rig
     assert (observations.extra["theta1_rate"] == 0).all()
 
 
+def test_a_standstill_is_one_pose_over_a_restart_of_the_daemon(rig: Rig) -> None:
+    start(rig, id="first")
+    rig.live(1, theta1=0.2)
+    rig.live(3)
+    rig.keeper = rig.new_keeper()
+    rig.live(3)
+    assert rig.say("show", id="first")["poses"] == 1
+    rig.live(1, theta1=0.2)
+    rig.live(1, theta1=-0.2)
+    rig.live(3)  # back at the same place: another standstill
+    rig.values["theta1"] += 0.1
+    rig.keeper = rig.new_keeper()  # moved while the daemon was down
+    rig.live(3)
+    assert rig.say("stop")["poses"] == 3
+
+
 def test_direction_and_dwell_are_empty_until_the_first_motion_after_a_start(rig: Rig) -> None:
     start(rig, id="first")
     rig.live(2)
