@@ -59,7 +59,7 @@ class AnyChannel(_Quantity):
         name: name of the joint that the channel reads, or of a signal (`boom_valve`).
         link: name of the CAN link in the daemon's configuration.
         unit: unit of the channel's value.
-        timeout_s: silence for longer than this is a gap.
+        timeout_s: silence for longer than this is a gap, and the last value of a signal is no longer used.
     """
 
     link: str = "boom"

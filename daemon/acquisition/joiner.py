@@ -37,7 +37,9 @@ class JoinedFix:
         fix: the fix as measured by the station.
         stamp: when it was measured: the fix's stamp minus the link delay.
         values: observations CSV column -> number (`theta1_deg`, `theta1_dir`, `theta1_rate`, `boom_valve_mA`, ...).
-        dwell_s: time since the last motion of any joint, or since the joints' first readings; None before these.
+            Whatever is unknown is left out: `theta1_dir` until theta1 is seen to move.
+        dwell_s: time since the last motion of any joint; None until one is seen, since joints may have moved unseen
+            before their first readings, before a preset, and between readings that are too far apart.
         standstill: number of the standstill, increasing; None while the boom moves or has not yet settled.
         refused: why calibration must not use it, a clause; "" if it may.
     """
@@ -64,6 +66,7 @@ class MachineState:
         oldest: joint whose newest reading is oldest; the others were read at that instant or later.
         values: observations CSV column -> number, as in a JoinedFix.
         dwell_s: as in a JoinedFix.
+        stands_s: time since a motion was last seen, or since the joints' first readings.
     """
 
     monotonic_ns: int
@@ -71,6 +74,7 @@ class MachineState:
     oldest: str
     values: Mapping[str, float]
     dwell_s: float | None
+    stands_s: float | None
 
 
 def joint_inputs(rig: Rig) -> list[JointInput]:
@@ -87,8 +91,8 @@ def joint_inputs(rig: Rig) -> list[JointInput]:
 
 
 def signal_inputs(rig: Rig) -> list[SignalInput]:
-    """Return the signals of a rig: its channels that are not joints."""
-    return [SignalInput(c.name, c.column) for c in rig.channels if c.name not in rig.joint_names]
+    """Return the signals of a rig: its channels that are not joints. A value is used until its channel is silent."""
+    return [SignalInput(c.name, c.column, c.timeout_s) for c in rig.channels if c.name not in rig.joint_names]
 
 
 class ObservationJoiner:
@@ -118,9 +122,9 @@ class ObservationJoiner:
         self.refusals: Counter[str] = Counter()
         self._delay_ns = {name: round(delay * NS_PER_S) for name, delay in (link_delay_s or {}).items()}
         self._deadline_ns = round(deadline_s * NS_PER_S)
-        self._joints = {joint.name: JointTrack(joint) for joint in joints}
-        self._signals = {signal.name: SignalTrack(signal) for signal in signals}
         self._motion = Motion(round(settle_s * NS_PER_S))
+        self._joints = {joint.name: JointTrack(joint, self._motion) for joint in joints}
+        self._signals = {signal.name: SignalTrack(signal) for signal in signals}
         self._pending: deque[tuple[Fix, Stamp]] = deque()
         self._boot_id = ""
         self._newest_ns = 0
@@ -155,7 +159,9 @@ class ObservationJoiner:
         values, missing = self._values(last.newest_ns, "the newest instant that all joints were read")
         if missing:
             return missing
-        return MachineState(last.newest_ns, self._boot_id, last.name, values, self._motion.at(last.newest_ns)[0])
+        at_ns = last.newest_ns
+        stands_s = self._motion.stands_s(at_ns)
+        return MachineState(at_ns, self._boot_id, last.name, values, self._motion.at(at_ns)[0], stands_s)
 
     def _restart(self, boot_id: str) -> list[JoinedFix]:
         """Discard all samples for a new boot, whose monotonic clock cannot be compared with the previous one's."""
@@ -175,8 +181,7 @@ class ObservationJoiner:
                 return
             joint = self._joints.get(record.channel)
             if joint is not None:
-                if joint.add(at_ns, record):
-                    self._motion.note(at_ns)
+                joint.add(at_ns, record)
             elif (signal := self._signals.get(record.channel)) is not None:
                 signal.add(at_ns, record.value)
         elif isinstance(record, Fix):
@@ -215,7 +220,8 @@ class ObservationJoiner:
                 missing = missing or f"{joint.name}: {found}"
                 continue
             values[f"{joint.name}_{joint.unit}"] = found.value
-            values[f"{joint.name}_dir"] = float(found.direction)
+            if found.direction is not None:
+                values[f"{joint.name}_dir"] = float(found.direction)
             if found.rate is not None:
                 values[f"{joint.name}_rate"] = found.rate
         for signal in self._signals.values():

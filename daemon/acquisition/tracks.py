@@ -3,6 +3,9 @@
 Motion is distinguished from noise by a reference that follows a resting joint slowly. A joint moves when it is further
 than `motion_threshold` from its reference, which is then set to the joint's value. A joint that creeps more slowly than
 the threshold per `REST_NS` therefore counts as standing.
+
+Before a joint's first sample, and between good samples too far apart, it may have moved and returned unseen. After that
+its last direction, and the time since the last motion of the boom, are unknown until the next motion.
 """
 
 from __future__ import annotations
@@ -56,15 +59,15 @@ class SignalInput:
 
     name: str
     column: str
-    max_age_s: float = 5.0
+    max_age_s: float
 
 
 @dataclass(frozen=True, slots=True)
 class State:
-    """A joint at one instant: value (deg or mm), last direction of motion (-1, 0, 1), rate (per second)."""
+    """A joint at one instant: value (deg or mm), last direction of motion (-1, 1), rate (per second); None: unknown."""
 
     value: float
-    direction: int
+    direction: int | None
     rate: float | None
 
 
@@ -97,43 +100,102 @@ class History(Generic[T]):
         self.items.clear()
 
 
-class JointTrack:
-    """Recent samples of one joint, and how it moves."""
+class Motion:
+    """Motions of the boom, and the number of each standstill between them."""
 
-    def __init__(self, joint: JointInput) -> None:
+    def __init__(self, settle_ns: int) -> None:
+        self._settle_ns = settle_ns
+        self._ended = 0  # number of standstills that have ended
+        self._moves: History[int] = History()  # this number at each motion
+        self._unseen: History[None] = History()  # ends of times in which joints may have moved unseen
+
+    def note(self, at_ns: int) -> None:
+        """Note a motion of any joint, or that a joint is first read."""
+        if self._moves.times_ns:
+            quiet_ns = at_ns - self._moves.times_ns[-1]
+            if quiet_ns < MOTION_STEP_NS:
+                return
+            self._ended += quiet_ns >= self._settle_ns
+        self._moves.add(at_ns, self._ended)
+
+    def note_unseen(self, at_ns: int) -> None:
+        """Note that a joint may have moved unseen until then, even if it is where it was."""
+        if self._unseen.newer(at_ns):
+            self._unseen.add(at_ns, None)
+
+    def restart(self) -> None:
+        """Begin a new standstill, because joints may have moved unnoticed."""
+        self._ended += bool(self._moves.times_ns)
+        self._moves.clear()
+        self._unseen.clear()
+
+    def stands_s(self, at_ns: int) -> float | None:
+        """Return the time since a motion was last seen, or since the joints' first readings; None before these."""
+        last = self._moves.latest(at_ns)
+        return None if last < 0 else (at_ns - self._moves.times_ns[last]) / NS_PER_S
+
+    def at(self, at_ns: int) -> tuple[float | None, int | None]:
+        """Return the dwell in seconds and the number of the standstill, as in JoinedFix."""
+        last = self._moves.latest(at_ns)
+        if last < 0:
+            return None, None
+        times_ns = self._moves.times_ns
+        dwell_ns = at_ns - times_ns[last]
+        leaving = last + 1 < len(times_ns) and times_ns[last + 1] - at_ns < STILL_AFTER_NS
+        standing = dwell_ns >= self._settle_ns and not leaving
+        unseen = self._unseen.latest(at_ns)
+        seen = unseen < 0 or self._unseen.times_ns[unseen] < times_ns[last]
+        return dwell_ns / NS_PER_S if seen else None, self._moves.items[last] + 1 if standing else None
+
+
+class JointTrack:
+    """Recent samples of one joint, and how it moves.
+
+    Args:
+        joint: the joint.
+        motion: told when the joint moves, and when it may have moved unseen.
+    """
+
+    def __init__(self, joint: JointInput, motion: Motion) -> None:
         self.name, self.unit = joint.name, joint.unit
-        self._joint = joint
+        self._joint, self._motion = joint, motion
         self._max_gap_ns = round(joint.max_gap_s * NS_PER_S)
-        self._samples: History[tuple[float | Status, int]] = History()  # value or bad status, last direction
+        self._standing_gap_ns = max(STANDING_GAP_NS, self._max_gap_ns)
+        self._samples: History[tuple[float | Status, int | None]] = History()  # value or bad status, last direction
         self._jumps: History[None] = History()
         self._reference: float | None = None
-        self._direction = 0
+        self._good_ns = 0  # of the last good sample, once there is a reference
+        self._direction: int | None = None
 
     @property
     def newest_ns(self) -> int:
         """Instant of the last sample; far in the past if there is none."""
         return self._samples.times_ns[-1] if self._samples.times_ns else -(2**63)
 
-    def add(self, at_ns: int, reading: Reading) -> bool:
-        """Add a sample; return True if the joint has moved, or this is its first sample ever or after a preset."""
+    def add(self, at_ns: int, reading: Reading) -> None:
+        """Add a sample; one that is older than the last is left out."""
         if not self._samples.newer(at_ns):
-            return False
+            return
         value = reading.value
         if reading.status is not Status.OK or value is None or not math.isfinite(value):
             bad = Status.MALFORMED if reading.status is Status.OK else reading.status
             self._samples.add(at_ns, (bad, self._direction))
-            return False
-        moved = False
-        if self._reference is None:
-            self._reference, moved = value, True
+            return
+        since_ns = at_ns - self._good_ns
+        change = 0.0 if self._reference is None else self._difference(value, self._reference)
+        is_seen = self._reference is not None and since_ns <= self._standing_gap_ns
+        if not is_seen:
+            self._direction = None
+            self._motion.note_unseen(at_ns)
+        if self._reference is None or abs(change) >= self._joint.motion_threshold:
+            self._reference = value
+            self._motion.note(at_ns)
+            if is_seen:
+                self._direction = 1 if change > 0 else -1
         else:
-            change = self._difference(value, self._reference)
-            if abs(change) >= self._joint.motion_threshold:
-                self._reference, self._direction, moved = value, 1 if change > 0 else -1, True
-            else:
-                self._reference += change * min(1.0, (at_ns - self.newest_ns) / REST_NS)
+            self._reference += change * min(1.0, since_ns / REST_NS)
+        self._good_ns = at_ns
         self._samples.add(at_ns, (value, self._direction))
-        return moved
 
     def jumped(self, at_ns: int) -> None:
         """Note a preset of the encoder: values before and after it cannot be compared."""
@@ -166,7 +228,7 @@ class JointTrack:
             return f"its reading at {of} is {start if isinstance(start, Status) else end}"
         span_ns = times_ns[after] - times_ns[before]
         stood = abs(self._difference(end, start)) <= self._joint.motion_threshold
-        if span_ns > (max(STANDING_GAP_NS, self._max_gap_ns) if stood else self._max_gap_ns):
+        if span_ns > (self._standing_gap_ns if stood else self._max_gap_ns):
             return f"its samples around {of} are more than {self._joint.max_gap_s:g} s apart"
         if self._jumps.latest(times_ns[after]) != self._jumps.latest(times_ns[before]):
             return f"its encoder was preset at {of}"
@@ -230,37 +292,3 @@ class SignalTrack:
         if last < 0 or at_ns - self._values.times_ns[last] > self._max_age_ns:
             return None
         return self._values.items[last]
-
-
-class Motion:
-    """Motions of the boom, and the number of each standstill between them."""
-
-    def __init__(self, settle_ns: int) -> None:
-        self._settle_ns = settle_ns
-        self._ended = 0  # number of standstills that have ended
-        self._moves: History[int] = History()  # this number at each motion
-
-    def note(self, at_ns: int) -> None:
-        """Note a motion of any joint."""
-        if self._moves.times_ns:
-            quiet_ns = at_ns - self._moves.times_ns[-1]
-            if quiet_ns < MOTION_STEP_NS:
-                return
-            self._ended += quiet_ns >= self._settle_ns
-        self._moves.add(at_ns, self._ended)
-
-    def restart(self) -> None:
-        """Begin a new standstill, because joints may have moved unnoticed."""
-        self._ended += bool(self._moves.times_ns)
-        self._moves.clear()
-
-    def at(self, at_ns: int) -> tuple[float | None, int | None]:
-        """Return the dwell in seconds and the number of the standstill, as in JoinedFix."""
-        last = self._moves.latest(at_ns)
-        if last < 0:
-            return None, None
-        times_ns = self._moves.times_ns
-        dwell_ns = at_ns - times_ns[last]
-        leaving = last + 1 < len(times_ns) and times_ns[last + 1] - at_ns < STILL_AFTER_NS
-        standing = dwell_ns >= self._settle_ns and not leaving
-        return dwell_ns / NS_PER_S, self._moves.items[last] + 1 if standing else None

@@ -88,7 +88,7 @@ class PositionWatch:
             return BoomPosition(values, None, None, False, "the joints were last read before the computer restarted")
         age_s = max(0.0, (now.monotonic_ns - state.monotonic_ns) / NS_PER_S)
         is_fresh = self._clock.real_seconds(age_s) <= FRESH_S
-        stands_s = state.dwell_s if state.dwell_s is not None and state.dwell_s >= _MOVING_S else None
+        stands_s = state.stands_s if state.stands_s is not None and state.stands_s >= _MOVING_S else None
         missing = "" if is_fresh else f"the joints were last read {age_s:.0f} s ago; is {state.oldest} silent?"
         return BoomPosition(values, age_s, stands_s if is_fresh else None, is_fresh, missing)
 

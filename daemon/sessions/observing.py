@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 
 from calibration.rig.description import Rig
-from daemon.acquisition.joiner import JoinedFix
+from daemon.acquisition.joiner import JoinedFix, joint_inputs
 from daemon.commands import CHECK
 from daemon.sessions.open_session import CONSTANT_TOLERANCE_MM, OpenSession
 from daemon.sessions.prism_watch import PrismWatch
@@ -23,6 +23,7 @@ from daemon.sessions.prisms.standstill_places import (
     Exclusions,
     Standstill,
     StandstillPlaces,
+    change_size,
 )
 from daemon.sessions.station_setups import AXES, Place
 from daemon.store.errors import is_unwritable
@@ -108,7 +109,8 @@ class ObservationMaker:
         table: its observations.
         pending: queue of changes to the store.
         prisms: decides which fixes are of another prism.
-        run_id: number of this run of the daemon; poses are numbered within a run.
+        run_id: number of this run of the daemon; poses are numbered within a run, but the first one goes on with the
+            last one of the run before if no joint has moved.
 
     Attributes:
         newest: session and instant of the newest observation, and why it is not used; None before the first.
@@ -120,6 +122,9 @@ class ObservationMaker:
         self._rig, self._store, self._pending, self._prisms, self._run_id = rig, store, pending, prisms, run_id
         self._table = table
         self._places = StandstillPlaces(rig)
+        self._motion_thresholds = {f"{joint.name}_{joint.unit}": joint.motion_threshold for joint in joint_inputs(rig)}
+        self._restored: tuple[Standstill, Mapping[str, float]] | None = None  # until the first standstill of this run
+        self._resumed: dict[Standstill, Standstill] = {}  # the first standstill of this run -> the one that goes on
         self.newest: tuple[str, Stamp, str | None] | None = None
 
     def restore(self, session: OpenSession) -> None:
@@ -133,6 +138,7 @@ class ObservationMaker:
                 place_mm, values = (row["x_mm"], row["y_mm"], row["z_mm"]), json.loads(row["values_json"])
                 confirmed = session.confirmations_by(stamp)
                 self._places.add(standstill, stamp.monotonic_ns, place_mm, values, confirmed)
+                self._restored = standstill, values
 
     def observe(self, session: OpenSession, joined: JoinedFix, place_mm: Place) -> None:
         """Make an observation of the session in which a fix was measured.
@@ -143,15 +149,16 @@ class ObservationMaker:
             place_mm: place of the fix in the station's frame.
         """
         constants_mm = session.constants_mm  # before the control points are asked for: both are renewed together
+        standstill = self._standstill(session, joined)
         excluded = (
             self._why_not_a_pose(session, joined, place_mm)
             or _why_another_constant(constants_mm, joined.fix)
-            or self._why_another_prism(session, joined, place_mm)
+            or self._why_another_prism(session, joined, place_mm, standstill)
         )
         if excluded is None and joined.fix.prism_constant_mm is not None:
             constants_mm.setdefault(joined.fix.station, joined.fix.prism_constant_mm)
         self.newest = session.id, joined.stamp, excluded
-        self._pending.add(lambda: self._add(session, joined, place_mm, excluded))
+        self._pending.add(lambda: self._add(session, joined, place_mm, standstill, excluded))
 
     def _why_not_a_pose(self, session: OpenSession, joined: JoinedFix, place_mm: Place) -> str | None:
         """Return why a fix cannot be used as a pose, whatever its prism; None if it can. Usable fixes are followed."""
@@ -169,13 +176,14 @@ class ObservationMaker:
             return self._prisms.doubt(session, joined.fix) or MOVING
         return None
 
-    def _why_another_prism(self, session: OpenSession, joined: JoinedFix, place_mm: Place) -> str | None:
+    def _why_another_prism(
+        self, session: OpenSession, joined: JoinedFix, place_mm: Place, standstill: Standstill | None
+    ) -> str | None:
         """Return why a fix may be of another prism, and judge earlier fixes again; None if it is not suspected."""
         changed = self._prisms.ask_joints(session, joined, place_mm)
         if changed:
             changed |= self._places.withdraw([at_ns for at_ns, why in changed.items() if why is not None])
         excluded = self._prisms.doubt(session, joined.fix)
-        standstill = self._standstill(session, joined)
         if excluded is None and standstill is not None:
             at_ns, confirmed = joined.stamp.monotonic_ns, session.confirmations_by(joined.fix.stamp)
             here = self._places.add(standstill, at_ns, place_mm, joined.values, confirmed)
@@ -185,18 +193,41 @@ class ObservationMaker:
         return excluded
 
     def _standstill(self, session: OpenSession, joined: JoinedFix) -> Standstill | None:
-        return None if joined.standstill is None else Standstill(session.id, self._run_id, joined.standstill)
+        """Return the standstill of a fix; None while the boom moves."""
+        if joined.standstill is None:
+            return None
+        own = Standstill(session.id, self._run_id, joined.standstill)
+        if self._restored is not None and not joined.refused:
+            before, values = self._restored
+            self._restored = None
+            if before.session == own.session and not self._has_moved(values, joined.values):
+                self._resumed[own] = before
+        return self._resumed.get(own, own)
+
+    def _has_moved(self, before: Mapping[str, float], now: Mapping[str, float]) -> bool:
+        """Return True if a joint is elsewhere than before, as for motion between samples."""
+        return any(
+            change_size(column, now[column] - before[column]) >= threshold
+            for column, threshold in self._motion_thresholds.items()
+            if column in before
+        )
 
     def _exclude(self, session: OpenSession, changed: Exclusions, stamp: Stamp) -> None:
         if changed:
             if_moving = MOVING if session.kind in STANDING_KINDS else None
             self._pending.add(lambda: self._table.exclude(session.id, changed, stamp, if_moving=if_moving))
 
-    def _add(self, session: OpenSession, joined: JoinedFix, place_mm: Place, excluded: str | None) -> None:
+    def _add(
+        self,
+        session: OpenSession,
+        joined: JoinedFix,
+        place_mm: Place,
+        standstill: Standstill | None,
+        excluded: str | None,
+    ) -> None:
         """Store an observation; a shot may have located a control point at its place since it was judged."""
         if excluded is None and session.is_control_point(place_mm):
             excluded = OF_CONTROL_POINT
-        standstill = self._standstill(session, joined)
         self._table.add(
             self._store.fix_id(joined.fix),
             joined.stamp,

@@ -164,7 +164,7 @@ class StandstillPlaces:
     def _moved_mm(self, before: Mapping[str, float], now: Mapping[str, float]) -> float:
         """Return the largest motion of any prism that the joints' changes explain."""
         changes = {column: now[column] - before[column] for column in now.keys() & before.keys()}
-        return sum(_size(column, change) * self._travel_mm[column] for column, change in changes.items())
+        return sum(change_size(column, change) * self._travel_mm[column] for column, change in changes.items())
 
     def _decide(self) -> Exclusions:
         """Exclude all places except the one with the most fixes, and return the exclusions that change."""
@@ -196,7 +196,7 @@ def _metres(place: _Place, other: _Place) -> str:
     return f"{math.dist(place.first_mm, other.first_mm) / 1000:.2f}"
 
 
-def _size(column: str, change: float) -> float:
+def change_size(column: str, change: float) -> float:
     """Return the size of a joint's change; for an angle, of the shorter way round."""
     return abs(math.remainder(change, 360.0) if column.endswith("_deg") else change)
 

@@ -251,7 +251,7 @@ TABLES: dict[str, Words] = {
             "pose": "id of the standstill; the same for all its fixes",
             **_XYZ,
             **_SIGMA,
-            "dwell_s": "time since the last motion, s",
+            "dwell_s": "time since the last motion, s; NULL until a motion is seen",
             "moving": "1 if the boom was moving",
             "values_json": "joints and signals by their columns of the observations CSV",
             "excluded": "why calibration must not use it; NULL if it may",

@@ -96,7 +96,7 @@ def channel_meaning(column: str, name: str, unit: str, *, is_joint: bool) -> str
         is_joint: whether the channel is a joint.
     """
     if column == f"{name}_dir":
-        return f"last direction of motion of joint {name}: -1, 0 or 1"
+        return f"last direction of motion of joint {name}, -1 or 1; NULL until it is seen to move"
     if column == f"{name}_rate":
         return f"speed of joint {name}, {unit}/s"
     return f"{'joint' if is_joint else 'signal'} {name}{f', {unit}' if unit else ''}"

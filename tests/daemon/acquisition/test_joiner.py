@@ -205,13 +205,16 @@ def test_a_preset_jump_is_not_interpolated_over() -> None:
     assert before.values["theta1_rate"] == after.values["theta1_rate"] == pytest.approx(0.0)
 
 
-def test_a_preset_jump_has_no_direction_but_ends_the_standstill() -> None:
-    def preset_at_2(t: float) -> float:
-        return 3.0 if t < 2 else 90.0
+def test_a_preset_jump_ends_the_standstill_and_what_is_known_of_motion_before_it() -> None:
+    def rises_and_is_preset_at_4(t: float) -> float:
+        return min(t, 1.0) if t < 4 else 90.0
 
-    (joined,) = join([*samples(4.0, preset_at_2), preset(2.003), preset(2.003), preset(2.0, "other"), fix(3.0)])
-    assert joined.values["theta1_dir"] == 0.0
-    assert joined.dwell_s == pytest.approx(3.0 - 2.003)
+    presets = [preset(4.003), preset(4.003), preset(4.0, "other")]
+    before, after = join([*samples(7.0, rises_and_is_preset_at_4), *presets, fix(3.0), fix(6.0)])
+    assert (before.values["theta1_dir"], before.standstill) == (1.0, 1)
+    assert before.dwell_s == pytest.approx(2.0, abs=0.1)
+    assert "theta1_dir" not in after.values
+    assert (after.dwell_s, after.standstill) == (None, 2)
 
 
 def test_fixes_that_are_not_ok_are_passed_over() -> None:
@@ -221,7 +224,7 @@ def test_fixes_that_are_not_ok_are_passed_over() -> None:
 
 
 def test_another_boot_ends_what_was_pending_and_begins_anew() -> None:
-    joiner = ObservationJoiner([THETA], [SignalInput("valve", "valve_mA")])
+    joiner = ObservationJoiner([THETA], [SignalInput("valve", "valve_mA", 5.0)])
     late = Reading("theta1", at(0.5, "boot-b"), 1.0, "deg")
     (joined,) = joiner.feed([*samples(1.0, 5.0), reading("valve", 0.5, 3.0, "mA"), fix(0.99), late])
     assert joined.refused == "theta1: no sample after the fix"
@@ -246,7 +249,7 @@ def test_records_of_other_kinds_and_channels_do_not_matter() -> None:
 
 
 def test_an_older_sample_that_comes_late_is_left_out() -> None:
-    joiner = ObservationJoiner([THETA], [SignalInput("valve", "valve_mA")])
+    joiner = ObservationJoiner([THETA], [SignalInput("valve", "valve_mA", 5.0)])
     joiner.feed([*samples(1.5, 5.0), reading("valve", 0.5, 3.0, "mA")])
     (joined,) = joiner.feed([reading("theta1", 0.9, 99.0), reading("valve", 0.2, 9.0, "mA"), fix(0.9)])
     assert joined.values["theta1_deg"] == 5.0
@@ -275,8 +278,8 @@ def journey() -> dict[float, JoinedFix]:
 
 
 def test_the_direction_is_that_of_the_last_motion(journey: dict[float, JoinedFix]) -> None:
-    direction = {t: j.values["theta1_dir"] for t, j in journey.items()}
-    assert {direction[t] for t in direction if t < 2.0} == {0.0}
+    direction = {t: j.values.get("theta1_dir") for t, j in journey.items()}
+    assert {direction[t] for t in direction if t < 2.0} == {None}, "it has not been seen to move yet"
     assert {direction[t] for t in direction if 2.1 < t < 8.0} == {1.0}
     assert {direction[t] for t in direction if t > 8.1} == {-1.0}
 
@@ -291,7 +294,7 @@ def test_a_single_sample_has_no_rate() -> None:
     (joined,) = join([reading("theta1", 1.0, 5.0), fix(1.0)], deadline_s=0.0) or join(
         [reading("theta1", 1.0, 5.0), reading("theta1", 9.0, 5.0), fix(1.0)]
     )
-    assert joined.values == {"theta1_deg": 5.0, "theta1_dir": 0.0}
+    assert joined.values == {"theta1_deg": 5.0}
 
 
 def test_dwell_counts_from_the_last_motion_of_any_joint(journey: dict[float, JoinedFix]) -> None:
@@ -315,17 +318,91 @@ def test_noise_alone_is_no_motion() -> None:
     generator = random.Random(3)
     records = samples(120.0, lambda _: with_noise(10.0, generator))
     (joined,) = join([*records, fix(119.0)])
-    assert (joined.standstill, joined.values["theta1_dir"]) == (1, 0.0)
-    assert joined.dwell_s == pytest.approx(119.0, abs=1.0)
+    assert (joined.standstill, joined.dwell_s) == (1, None)
+    assert "theta1_dir" not in joined.values
 
 
 def test_a_long_standstill_is_remembered_by_a_late_fix() -> None:
-    def moves_at_100(t: float) -> float:
-        return 10.0 if t < 100 else 20.0
+    def moves_at_once_and_at_100(t: float) -> float:
+        return 5.0 if t < 0.5 else 10.0 if t < 100 else 20.0
 
-    (joined,) = join([*samples(101.0, moves_at_100), fix(99.0)])
-    assert joined.dwell_s == pytest.approx(99.0, abs=0.01)
+    (joined,) = join([*samples(101.0, moves_at_once_and_at_100), fix(99.0)])
+    assert joined.dwell_s == pytest.approx(98.5, abs=0.01)
     assert joined.standstill == 1
+
+
+# ---- motion that was not seen ----------------------------------------------------------------------------------------
+
+
+def rises_in_the_first_second(t: float) -> float:
+    return min(t, 1.0)
+
+
+def test_a_boom_that_stands_since_the_start_is_a_standstill_of_unknown_dwell_and_direction() -> None:
+    early, late = join([*samples(6.0, 5.0), fix(0.5), fix(5.0)])
+    assert (early.standstill, late.standstill) == (None, 1)
+    assert (early.dwell_s, late.dwell_s) == (None, None)
+    assert "dwell_s" not in late.columns()
+    assert "theta1_dir" not in late.values
+
+
+def test_the_motion_of_one_joint_tells_the_dwell_but_no_direction_of_another() -> None:
+    (joined,) = join([*samples(5.0, rises_in_the_first_second), *samples(5.0, 7.0, name="L2"), fix(4.0)], THETA, LENGTH)
+    assert joined.dwell_s == pytest.approx(3.0, abs=0.1)
+    assert joined.values["theta1_dir"] == 1.0
+    assert "L2_dir" not in joined.values
+
+
+@pytest.mark.parametrize(("after_deg", "standstill"), [(1.0, 1), (1.02, 1), (-4.0, 2), (6.0, 2)])
+def test_after_an_outage_direction_and_dwell_are_unknown_wherever_the_joint_is(
+    after_deg: float, standstill: int
+) -> None:
+    """It may have gone up and come back down, even where it is as before; only elsewhere it is another standstill."""
+    cut = [*samples(4.0, rises_in_the_first_second), *samples(70.0, after_deg, start_s=64.0)]
+    before, after = join([*cut, fix(3.0), fix(68.0)])
+    assert (before.values["theta1_dir"], before.standstill) == (1.0, 1)
+    assert "theta1_dir" not in after.values
+    assert (after.dwell_s, after.standstill) == (None, standstill)
+
+
+def test_motion_after_an_outage_is_known_again() -> None:
+    def falls_at_66(t: float) -> float:
+        return 1.0 - 3.0 * min(max(t - 66.0, 0.0), 1.0)
+
+    (joined,) = join([*samples(4.0, rises_in_the_first_second), *samples(71.0, falls_at_66, start_s=64.0), fix(70.0)])
+    assert joined.values["theta1_dir"] == -1.0
+    assert joined.dwell_s == pytest.approx(3.0, abs=0.1)
+
+
+@pytest.mark.parametrize(("bad_s", "is_known"), [(0.9, True), (3.0, False)])
+def test_bad_readings_hide_a_motion_if_they_last_long_enough(bad_s: float, is_known: bool) -> None:
+    bad = [reading("theta1", 2.01 + n / 20, None, status=Status.DEVICE_ALARM) for n in range(round(bad_s * 20))]
+    good = [*samples(2.0, rises_in_the_first_second), *samples(9.0, 1.0, start_s=2.0 + bad_s)]
+    (joined,) = join([*good, *bad, fix(8.0)])
+    assert ("theta1_dir" in joined.values) == is_known
+    assert (joined.dwell_s is not None) == is_known
+    assert joined.standstill == 1
+
+
+def test_a_joint_that_was_silent_may_have_moved_after_the_others() -> None:
+    """The dwell since the last motion that was seen would be wrong, though every other joint was seen all the time."""
+
+    def moves_at_30(t: float) -> float:
+        return 100.0 if t < 30 else 200.0
+
+    of_theta = [*samples(4.0, rises_in_the_first_second), *samples(70.0, 1.0, start_s=64.0)]
+    (joined,) = join([*of_theta, *samples(70.0, moves_at_30, name="L2"), fix(68.0)], THETA, LENGTH)
+    assert joined.values["L2_dir"] == 1.0
+    assert joined.dwell_s is None
+
+
+def test_the_state_tells_how_long_the_boom_is_seen_to_stand_though_its_dwell_is_unknown() -> None:
+    joiner = ObservationJoiner([THETA])
+    joiner.feed(samples(5.0, 7.0))
+    state = joiner.latest()
+    assert not isinstance(state, str)
+    assert state.dwell_s is None
+    assert state.stands_s == pytest.approx(5.0, abs=0.1)
 
 
 # ---- signals ---------------------------------------------------------------------------------------------------------
@@ -333,7 +410,7 @@ def test_a_long_standstill_is_remembered_by_a_late_fix() -> None:
 
 def test_signals_are_the_latest_before_the_fix() -> None:
     records = [*samples(3.0), *(reading("valve", t / 2, float(t), "mA") for t in range(6)), fix(1.25)]
-    (joined,) = join(records, THETA, signals=[SignalInput("valve", "valve_mA")])
+    (joined,) = join(records, THETA, signals=[SignalInput("valve", "valve_mA", 5.0)])
     assert joined.values["valve_mA"] == 2.0
 
 
@@ -362,6 +439,20 @@ def test_a_rig_says_what_its_fixes_need() -> None:
     signals = signal_inputs(rig)
     assert {s.name for s in signals} == {c.name for c in rig.channels} - set(rig.joint_names)
     assert all(s.column == next(c.column for c in rig.channels if c.name == s.name) for s in signals)
+
+
+def test_a_signal_is_joined_until_its_channel_counts_as_silent() -> None:
+    rig = shipped_rig("swdt82")
+    of_name = {channel.name: channel for channel in rig.channels}
+    slow, quick = of_name["temperature"].model_copy(update={"timeout_s": 30.0}), of_name["boom_pressure"]
+    inputs = signal_inputs(rig.model_copy(update={"channels": (slow, quick)}))
+    sent: list[Record] = [reading(slow.name, float(t), 20.0, slow.unit) for t in range(0, 31, 10)]
+    sent += [reading(quick.name, t / 10, 100.0, quick.unit) for t in range(100)]
+    fixes = [fix(t / 4) for t in range(4, 160)]
+    joined = join([*samples(45.0, 5.0), *sent, *fixes], THETA, signals=inputs)
+    assert all(slow.column in j.values for j in joined), "a value every 10 s is not old"
+    last_s = max(j.stamp.since(at(0.0)) / 1e9 for j in joined if quick.column in j.values)
+    assert last_s == pytest.approx(9.9 + 1.0, abs=0.2), "it was last read at 9.9 s"
 
 
 def test_a_thousand_samples_a_second_are_no_burden() -> None:
@@ -408,7 +499,7 @@ def test_readings_of_doubtful_time_do_not_keep_a_standing_joint_from_being_joine
 
 
 def test_a_signal_of_doubtful_time_leaves_the_value_before_it() -> None:
-    joiner = ObservationJoiner((THETA,), (SignalInput("pump", "pump_bar"),))
+    joiner = ObservationJoiner((THETA,), (SignalInput("pump", "pump_bar", 5.0),))
     records: list[Record] = [reading("pump", 0.5, 120.0, "bar"), late(0.9, "pump", "bar")]
     (joined,) = joiner.feed([*samples(2.0), *records, fix(1.0)])
     assert joined.values["pump_bar"] == 120.0

@@ -75,6 +75,12 @@ def test_a_boom_that_has_just_come_to_a_stand_is_not_said_to_move(
     assert stood_s[-1] > 0.5
 
 
+def test_a_boom_that_stands_since_the_start_of_the_daemon_is_said_to_stand(rig: WatchedRig) -> None:
+    rig.at_a_pose(plan=[POSE] * 6)
+    rig.live(2.0)
+    assert rig.guide.state_command({})["guide"]["hold"]["since_s"] == pytest.approx(2.0, abs=2 * STEP_S)
+
+
 def test_fixes_that_do_not_count_are_told_however_late_they_arrive(
     rig: WatchedRig, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -9,18 +9,25 @@ import pytest
 
 from calibration.model.model import CalibratedModel
 from calibration.model.prediction import Predictor
+from calibration.observations import parse_observations
+from calibration.pipeline.calibrate import identify
 from daemon.commands import CommandError
 from daemon.config.sections import TipCanSection, TipSection
 from daemon.host.ended_threads import EndedThreads
 from daemon.models.live_model import Loaded
+from daemon.models.model_files import write_model
 from daemon.models.tip_sender import TipSender
 from drivers.can.ports import CanLinkConfig
 from drivers.can.tip_frames import TipStatus, encode_tip
 from drivers.can_link import CanLink
 from drivers.clock import NS_PER_S, Stamp, SystemClock
 from drivers.readings import DeviceEvent, EventKind, Status
+from simulators.effects.library import parse_effects
+from simulators.rig.truth import RigTruth
+from tests.daemon.support.jobs import SOURCE
 from tests.daemon.support.models import TRUTH, ModelRig, pose
 from tests.drivers.can_support import running, unused_channel
+from tests.simulated.observations import simulate_observations
 
 
 @pytest.fixture
@@ -237,6 +244,43 @@ def test_a_pose_beyond_the_training_data_is_given_as_doubtful(rig: ModelRig) -> 
     assert untrained.status is TipStatus.DOUBTFUL
     assert untrained.base_mm is not None
     assert any("was never measured in training" in warning for warning in untrained.warnings)
+
+
+@pytest.fixture(scope="module")
+def play_model(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A model with 3 mrad of play at theta4."""
+    truth = RigTruth(SOURCE.rig, 5, effects=parse_effects("backlash@theta4:width_rad=3e-3"))
+    data = simulate_observations(truth, 40, 11, setup="S1", prisms=("r",), noise_mm=0.5)
+    observations = parse_observations(data.csv_text().encode(), SOURCE.rig, "simulated.csv")
+    directory = tmp_path_factory.mktemp("play") / "model"
+    write_model(directory, identify(SOURCE.rig, SOURCE.text, observations, effects="backlash@theta4"))
+    return directory
+
+
+def test_the_tip_of_a_model_with_play_is_doubtful_from_a_start_until_its_joint_moves(
+    tmp_path: Path, play_model: Path
+) -> None:
+    rig = ModelRig(tmp_path)
+    try:
+        rig.registry.accept_command({"id": rig.compared(rig.candidate(trained=play_model), live=None), "operator": "A"})
+        rig.settled()
+        rig.drive(pose(1) | {"theta4": pose(1)["theta4"] - 0.2})
+        started = rig.tip.tip("r")
+        assert started.status is TipStatus.DOUBTFUL
+        assert any("lacks the column theta4_dir" in warning for warning in started.warnings), started.warnings
+        rig.drive(pose(1))
+        known = rig.tip.tip("r")
+        assert (known.status, known.warnings) == (TipStatus.OK, ())
+        assert known.sigma_mm is not None
+        rig.clock.advance(60.0)  # the bus is cut, and the joint may move up and come back from above
+        rig.drive(pose(1))
+        again = rig.tip.tip("r")
+        assert again.status is TipStatus.DOUBTFUL
+        assert again.sigma_mm is not None
+        off_mm = np.linalg.norm(np.subtract(again.base_mm, known.base_mm))
+        assert again.sigma_mm > off_mm > 3.0 * known.sigma_mm, "its sigma covers both ends of the play"
+    finally:
+        rig.close()
 
 
 def test_a_model_that_fails_in_a_pose_says_so(rig: ModelRig, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,3 +1,4 @@
+import itertools
 import math
 import socket
 import time
@@ -49,6 +50,7 @@ def test_every_standstill_becomes_a_pose(rig: Rig) -> None:
 
 def test_observations_leave_as_the_contracts_csv_and_can_be_read_as_one(rig: Rig) -> None:
     start(rig, id="first")
+    rig.live(0.5, theta4=0.2)
     rig.live(2)
     rig.say("stop")
     with Reader(rig.store.path) as reader:
@@ -61,6 +63,48 @@ def test_observations_leave_as_the_contracts_csv_and_can_be_read_as_one(rig: Rig
     assert observations.position_mm[0] == pytest.approx((3000.0, 8000.0, 1000.0), abs=1e-6)
     assert (observations.extra["dwell_s"] > 0).all()
     assert (observations.extra["theta1_rate"] == 0).all()
+
+
+def test_a_standstill_is_one_pose_over_a_restart_of_the_daemon(rig: Rig) -> None:
+    start(rig, id="first")
+    rig.live(1, theta1=0.2)
+    rig.live(3)
+    rig.keeper = rig.new_keeper()
+    rig.live(3)
+    assert rig.say("show", id="first")["poses"] == 1
+    rig.live(1, theta1=0.2)
+    rig.live(1, theta1=-0.2)
+    rig.live(3)  # back at the same place: another standstill
+    rig.values["theta1"] += 0.1
+    rig.keeper = rig.new_keeper()  # moved while the daemon was down
+    rig.live(3)
+    assert rig.say("stop")["poses"] == 3
+
+
+def test_direction_and_dwell_are_empty_until_the_first_motion_after_a_start(rig: Rig) -> None:
+    start(rig, id="first")
+    rig.live(2)
+    rig.live(1, theta1=-0.2)
+    rig.live(2)
+    rig.keeper = rig.new_keeper()  # as a daemon that was started again while the boom stands
+    rig.live(2)
+    rig.live(1, theta4=0.2)
+    rig.live(2)
+    rig.say("stop")
+    with Reader(rig.store.path) as reader:
+        observations = parse_observations(sessions_csv(reader, SOURCE.rig, ["first"]), SOURCE.rig, "stored")
+        stored = list(reader.rows("SELECT theta1_dir FROM v_observations WHERE excluded IS NULL"))
+    has_dwell = np.isfinite(observations.extra["dwell_s"])
+    states = zip(has_dwell, observations.extra["theta1_dir"], observations.extra["theta4_dir"], strict=True)
+    assert [
+        state for state, _ in itertools.groupby(f"({dwell}, {theta1}, {theta4})" for dwell, theta1, theta4 in states)
+    ] == [
+        "(False, nan, nan)",
+        "(True, -1.0, nan)",
+        "(False, nan, nan)",  # the daemon started again
+        "(True, nan, 1.0)",
+    ]
+    assert {row["theta1_dir"] for row in stored} == {None, -1.0}
 
 
 def test_a_signal_without_a_device_stands_in_the_way_of_nothing(
