@@ -202,13 +202,21 @@ class SessionManager:
             return self._table.summary(self._close("aborted").id, self._observations.tally)
 
     def accept_command(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
-        """Let calibration use a closed session although nothing shows that the station stood still."""
+        """Let calibration use a closed session that it would otherwise not use."""
         with self.turn:
             session_id, operator = str(arguments.get("id", "")), text_argument(arguments, "operator")
             despite = self._lifecycle.accept(session_id, operator)
             log.warning(
                 "session %s is used, accepted by %s despite: %s", session_id, operator or "an operator", despite
             )
+            return self._table.summary(session_id)
+
+    def reject_command(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
+        """Keep calibration from using a closed session, until an operator accepts it."""
+        with self.turn:
+            session_id, operator = str(arguments.get("id", "")), text_argument(arguments, "operator")
+            why = self._lifecycle.reject(session_id, operator, text_argument(arguments, "reason").strip())
+            log.warning("session %s is not used: %s", session_id, why)
             return self._table.summary(session_id)
 
     def shoot_command(self, arguments: Mapping[str, Any], *, most_off_mm: float = math.inf) -> dict[str, Any]:
