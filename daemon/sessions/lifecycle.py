@@ -278,9 +278,10 @@ class SessionLifecycle:
             self.table.change(session_id, rejected_reason=reason, accepted_despite=None)
             if excluded is None:
                 self.table.change(session_id, accepted_after_job=self._jobs.newest_id())
-            why = self._why_not_used(session_id)
-            self.table.change(session_id, excluded=why)
-        return why or ""
+            excluded = self._why_not_used(session_id)
+            self.table.change(session_id, excluded=excluded)
+        assert excluded is not None  # it is rejected
+        return excluded
 
     def _decide(self, session_id: str, operator: str, decision: str, *, instead_of: str) -> None:
         """Store who decided on a session and when, in place of an earlier decision."""
