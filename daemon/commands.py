@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import re
+import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextvars import ContextVar
 from dataclasses import dataclass
@@ -16,6 +17,7 @@ SESSION_KINDS = ("single_joint", "multi_joint", "static_poses", CHECK)
 HOW_TO_END = "stop or abort it first: `rigcal session stop`, or `rigcal session abort` if it is unusable"
 OTHER_RIG_FILE = "it was recorded with another rig file: "  # beginning of the reason why a session is not used
 HOW_TO_READ_AGAIN = "to read its captures with this one, `rigcal session export` it, and `rigcal replay` the files"
+LOOK_S = 0.5  # how often a command that waits checks whether its caller is still connected
 MAX_TEXT_CHARACTERS = 500
 MAX_ENTRIES = 100
 
@@ -107,6 +109,45 @@ def acting_for(caller: Caller | None, is_cancelled: Callable[[], bool] | None = 
     finally:
         _current.reset(token)
         _is_cancelled.reset(left_token)
+
+
+class CommandTurn:
+    """Reentrant lock that is held while a command is carried out: commands wait for their turn.
+
+    A command whose caller disconnects while it waits is not carried out: entering raises CommandError, within half a
+    second or as soon as its turn comes. Once it has its turn, it may enter again, whether its caller is connected or
+    not.
+    """
+
+    def __init__(self) -> None:
+        self._lock = threading.RLock()
+        self._depth = 0  # how often the thread that has its turn has entered
+
+    def __enter__(self) -> None:
+        while not self._lock.acquire(timeout=LOOK_S):
+            raise_if_cancelled()
+        try:
+            if not self._depth:
+                raise_if_cancelled()
+        except CommandError:
+            self._lock.release()
+            raise
+        self._depth += 1
+
+    def __exit__(self, *_: object) -> None:
+        self.leave()
+
+    def enter_if_free(self) -> bool:
+        """Enter without waiting; return False if a command of another thread is being carried out."""
+        if not self._lock.acquire(blocking=False):
+            return False
+        self._depth += 1
+        return True
+
+    def leave(self) -> None:
+        """Leave, as the end of a `with` block does."""
+        self._depth -= 1
+        self._lock.release()
 
 
 # ---- arguments -------------------------------------------------------------------------------------------------------

@@ -78,6 +78,7 @@ class Commands:
             "session.shoot": sessions.shoot_command,
             "session.confirm-prism": sessions.confirm_prism_command,
             "session.accept": sessions.accept_command,
+            "session.reject": sessions.reject_command,
             "session.list": sessions.list_command,
             "session.show": sessions.show_command,
             "jobs.list": jobs.list_command,

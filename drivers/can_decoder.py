@@ -61,18 +61,21 @@ class CanDecoder:
             for arbitration_id, handler in supervision.handlers.items():
                 self._entry(arbitration_id, False).handler = handler
 
+    @property
+    def channels(self) -> frozenset[str]:
+        """Names of the link's channels."""
+        return frozenset(channel.name for channel in self._channels)
+
     def recall(self, events: Iterable[DeviceEvent]) -> list[DeviceEvent]:
         """Restore the state of nodes from events that were recorded before this decoder was created.
 
         Args:
-            events: events of any devices, the last of each kind, oldest first.
+            events: events of any devices except those on other links, the last of each kind, oldest first.
 
         Returns:
             The events that changed the state of one of the link's nodes, each under the node's current name.
         """
-        own = {channel.name for channel in self._channels}
-        mine = [event for event in events if event.device in own]
-        return [taken for event in mine for node in self._nodes for taken in node.recall(event)]
+        return [taken for event in events for node in self._nodes for taken in node.recall(event)]
 
     def feed(self, capture: Capture) -> Sequence[Record]:
         if type(capture) is not CanCapture:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
 
 from drivers.can.summary import CanSummary
 from drivers.can_decoder import CanDecoder
@@ -105,4 +106,17 @@ class LinkDecoders:
     def _make(self, link: str, at: Stamp) -> list[DeviceEvent]:
         decoder = self._decoders[link] = self._factories[link]()
         self._boots[link] = at.boot_id
-        return decoder.recall(self._recalled(at)) if isinstance(decoder, CanDecoder) else []
+        if not isinstance(decoder, CanDecoder):
+            return []
+        return decoder.recall(event for event in self._recalled(at) if self._links.get(event.device, link) == link)
+
+    @cached_property
+    def _links(self) -> dict[str, str]:
+        """Channel -> its CAN link. A channel that an earlier rig file named may have been on any link."""
+        made = {link: make() for link, make in self._factories.items()}
+        return {
+            channel: link
+            for link, decoder in made.items()
+            if isinstance(decoder, CanDecoder)
+            for channel in decoder.channels
+        }

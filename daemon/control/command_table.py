@@ -84,6 +84,11 @@ COMMANDS: Mapping[str, Command] = MappingProxyType(
         "session.accept": _changes(
             "lets calibration use a session that it would otherwise not use", {"id": "name of the session"}
         ),
+        "session.reject": _changes(
+            "keeps calibration from using a closed session, until it is accepted",
+            {"id": "name of the session"},
+            reason="text: why; kept with the session",
+        ),
         "session.list": _looks("returns all sessions"),
         "session.show": _looks("returns one session with its control points and jobs", {"id": "name of the session"}),
         "jobs.list": _looks("returns all jobs"),

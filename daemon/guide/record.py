@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import logging
-import threading
 from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
-from daemon.commands import REFUSED, CommandError, caller_columns
+from daemon.commands import REFUSED, CommandError, CommandTurn, caller_columns
 from daemon.guide.job import Job, Request
 from daemon.guide.view import headline
 from daemon.store.queries.guides import GuideRow, GuideTable
@@ -30,14 +29,14 @@ class GuideRecord:
         clock: clock for the timestamps of events.
 
     Attributes:
-        turn: lock to hold while several attributes are read or changed together.
+        turn: to be held while several attributes are read or changed together.
         row, job: row and job of the newest guide; None before the first.
         taps: number of commands given to it.
         table: table of all guides.
     """
 
     def __init__(self, store: Store, rig_name: str, clock: Clock) -> None:
-        self.turn = threading.RLock()
+        self.turn = CommandTurn()
         self.row: GuideRow | None = None
         self.job: Job | None = None
         self.taps = 0

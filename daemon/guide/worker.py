@@ -117,22 +117,21 @@ class GuideWorker(WorkerThread):
             if run.session and run.poses is None:
                 course.choose(run.most)
             is_at_point = not self._has_aim and course.watch.is_at(course.point_mm(course.point(job)))
-        with acting_for(None, partial(self._is_over, at)):
-            if not run.session:
-                self._try(self._open_session, at)
-            elif step.kind == "close":
-                self._try(partial(self._close_session, at), at)
-            elif step.kind == "shoot_control_point":
-                if self._has_aim or is_at_point or self.wanted == step_id:
-                    self._try(partial(self._shoot, step.point, at), at, step_id)
-            elif step.kind == "change_prism":
-                if self._has_aim:
-                    course.aimed(only_at=at)
-            elif job.is_enough and (self._has_aim or is_at_point or run.kind == CHECK):
-                course.happen("left", {}, only_at=at)
-            elif not job.is_enough:
-                self._send_boom(job)
-                self._look_at_pose(job, at)
+        if not run.session:
+            self._try(self._open_session, at)
+        elif step.kind == "close":
+            self._try(partial(self._close_session, at), at)
+        elif step.kind == "shoot_control_point":
+            if self._has_aim or is_at_point or self.wanted == step_id:
+                self._try(partial(self._shoot, step.point, at), at, step_id)
+        elif step.kind == "change_prism":
+            if self._has_aim:
+                course.aimed(only_at=at)
+        elif job.is_enough and (self._has_aim or is_at_point or run.kind == CHECK):
+            course.happen("left", {}, only_at=at)
+        elif not job.is_enough:
+            self._send_boom(job)
+            self._look_at_pose(job, at)
 
     def _is_over(self, at: GuideStep) -> bool:
         """Return True if work for a step is cancelled, or the guide is no longer at that step."""
@@ -222,7 +221,8 @@ class GuideWorker(WorkerThread):
             self._course.happen("closed", {"session": job.run.session})
 
     def _shoot(self, point: str, at: GuideStep) -> None:
-        shot = self._sessions.shoot_command({"point": point}, most_off_mm=CONTROL_POINT_RADIUS_MM)
+        with acting_for(None, partial(self._is_over, at)):
+            shot = self._sessions.shoot_command({"point": point}, most_off_mm=CONTROL_POINT_RADIUS_MM)
         with self._course.record.turn:
             guide = self._course.record.opened()
             self._course.happen("shot", {"point": point, "misclosure_mm": shot["misclosure_mm"]}, only_at=at)

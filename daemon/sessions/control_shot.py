@@ -8,7 +8,7 @@ import threading
 from concurrent.futures import Future
 from dataclasses import dataclass, field
 
-from daemon.commands import FAILED, CommandError, is_cancelled
+from daemon.commands import FAILED, LOOK_S, CommandError, is_cancelled
 from daemon.sessions.station_setups import Place
 from drivers.clock import Clock, Order, Stamp, lies_within
 from drivers.readings import Fix, Status
@@ -17,7 +17,6 @@ from drivers.stations.survey import position_mm
 log = logging.getLogger(__name__)
 
 SPREAD_MM = 20.0  # fixes of one shot that lie further apart are not of one stationary target
-_LOOK_S = 0.5  # how often a shot checks whether its caller is still connected
 
 
 @dataclass
@@ -72,8 +71,8 @@ class Shot:
         self.done.add_done_callback(lambda _: arrived.set())
         left_s, is_complete = timeout_s, False
         while left_s > 0 and not is_complete:
-            is_complete = clock.wait(arrived, min(left_s, _LOOK_S))
-            left_s -= _LOOK_S
+            is_complete = clock.wait(arrived, min(left_s, LOOK_S))
+            left_s -= LOOK_S
             if is_cancelled():
                 log.info("a shot of a control point was cancelled: its caller has disconnected")
                 raise CommandError("the shot was cancelled, and nothing was stored", FAILED)

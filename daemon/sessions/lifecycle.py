@@ -1,8 +1,9 @@
 """All changes of a calibration session's state, and the decision whether calibration may use it.
 
-A session is open, then closed or aborted. When it is closed, it is decided whether calibration may use it. It may not
+A session is open, then closed or aborted. Once it is closed, it is decided whether calibration may use it. It may not
 
 - if no control point shows that the station stood still from its start to its end, until an operator accepts it;
+- if an operator has rejected it, until one accepts it;
 - if a rig file other than the present one converted counts into its readings, until that file is in use again;
 - if an encoder has jumped since, until the joint's zero has been checked.
 
@@ -242,22 +243,62 @@ class SessionLifecycle:
                 raise CommandError(f"session {session_id!r} is already used by calibration; there is nothing to accept")
             if despite.startswith(OTHER_RIG_FILE):
                 raise CommandError(f"session {session_id!r}: {despite}; {HOW_TO_READ_AGAIN}", REFUSED)
-            self.table.change(
-                session_id,
-                excluded=None,
-                accepted_despite=despite,
-                accepted_by=operator,
-                accepted_after_job=self._jobs.newest_id(),
-                **caller_columns("accepted_"),
-                **self._store.instant(self._clock.now(), "accepted_"),
-            )
+            self._decide(session_id, operator, "accepted", instead_of="rejected")
+            told = {"accepted_despite": despite, "accepted_after_job": self._jobs.newest_id()}
+            self.table.change(session_id, excluded=None, rejected_reason=None, **told)
         return despite
+
+    def reject(self, session_id: str, operator: str, reason: str) -> str:
+        """Keep calibration from using a closed session from now on, until an operator accepts it.
+
+        Training that has used the session is repeated without it.
+
+        Args:
+            session_id: the session.
+            operator: name of the operator; "" if unknown.
+            reason: why; "" if unknown.
+
+        Returns:
+            The reason why it is not used.
+
+        Raises:
+            CommandError: the session is not closed, or rejected already.
+            NotInStoreError: there is no such session.
+        """
+        with self._store.transaction():
+            state, excluded = self.table.state_and_exclusion(session_id)
+            if state != "closed":
+                why = (
+                    "is open; abort it: `rigcal session abort`" if state == "open" else "was aborted, and is never used"
+                )
+                raise CommandError(f"session {session_id!r} {why}")
+            if _why_rejected(self._row(session_id)):
+                raise CommandError(f"session {session_id!r} is already rejected")
+            self._decide(session_id, operator, "rejected", instead_of="accepted")
+            self.table.change(session_id, rejected_reason=reason, accepted_despite=None)
+            if excluded is None:
+                self.table.change(session_id, accepted_after_job=self._jobs.newest_id())
+            excluded = self._why_not_used(session_id)
+            self.table.change(session_id, excluded=excluded)
+        assert excluded is not None  # it is rejected
+        return excluded
+
+    def _decide(self, session_id: str, operator: str, decision: str, *, instead_of: str) -> None:
+        """Store who decided on a session and when, in place of an earlier decision."""
+        told = {"by": operator, **caller_columns(), **self._store.instant(self._clock.now())}
+        untold = dict.fromkeys(told) | {"by": ""}
+        self.table.change(
+            session_id,
+            **{f"{decision}_{key}": value for key, value in told.items()},
+            **{f"{instead_of}_{key}": value for key, value in untold.items()},
+        )
 
     def _why_not_used(self, session_id: str) -> str | None:
         """Return why calibration must not use a session, a clause; None if it may."""
         row = self._row(session_id)
         reasons = (
             self._why_other_readings(row),
+            _why_rejected(row),
             _why_left_open(row),
             self._why_other_constant(row),
             self._why_moved(session_id),
@@ -297,6 +338,14 @@ class SessionLifecycle:
         if has_poses_before_enclosed(self._store, session_id):
             return NOT_THE_SAME
         return None if is_enclosed(self._store, session_id, LEAST_ENCLOSED) else NOT_ENCLOSED
+
+
+def _why_rejected(row: Mapping[str, Any]) -> str | None:
+    """Return that an operator has rejected a session, a clause; None if none has, or it was accepted since."""
+    if row["rejected_utc_ns"] is None:
+        return None
+    reason = f": {row['rejected_reason']}" if row["rejected_reason"] else ""
+    return f"it was rejected by {row['rejected_by'] or 'an operator'}{reason}"
 
 
 def _why_left_open(row: Mapping[str, Any]) -> str | None:

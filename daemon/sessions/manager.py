@@ -10,7 +10,6 @@ from __future__ import annotations
 import logging
 import math
 import sqlite3
-import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from typing import Any
@@ -21,6 +20,7 @@ from daemon.commands import (
     HOW_TO_END,
     SESSION_KINDS,
     CommandError,
+    CommandTurn,
     caller_columns,
     identifier,
     raise_if_cancelled,
@@ -68,8 +68,8 @@ class SessionManager:
         clock_state: returns the state of the computer's clock, noted with a session; None for a different clock.
 
     Attributes:
-        turn: lock that is held while a command is carried out. A caller that runs several commands in one transaction
-            takes the lock before the transaction.
+        turn: held while a command is carried out. A caller that runs several commands in one transaction enters it
+            before the transaction.
     """
 
     def __init__(
@@ -95,7 +95,7 @@ class SessionManager:
         self._table, self._observations = self._lifecycle.table, ObservationTable(store)
         self._jobs = JobTable(store, rig.name)
         self._aim = aim
-        self.turn = threading.RLock()
+        self.turn = CommandTurn()
         self._shot: Shot | None = None
         self._pending = PendingWrites(store)
         self._prisms = PrismWatch(store, rig, clock, limits or {}, self._pending.add_event)
@@ -202,13 +202,21 @@ class SessionManager:
             return self._table.summary(self._close("aborted").id, self._observations.tally)
 
     def accept_command(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
-        """Let calibration use a closed session although nothing shows that the station stood still."""
+        """Let calibration use a closed session that it would otherwise not use."""
         with self.turn:
             session_id, operator = str(arguments.get("id", "")), text_argument(arguments, "operator")
             despite = self._lifecycle.accept(session_id, operator)
             log.warning(
                 "session %s is used, accepted by %s despite: %s", session_id, operator or "an operator", despite
             )
+            return self._table.summary(session_id)
+
+    def reject_command(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
+        """Keep calibration from using a closed session, until an operator accepts it."""
+        with self.turn:
+            session_id, operator = str(arguments.get("id", "")), text_argument(arguments, "operator")
+            why = self._lifecycle.reject(session_id, operator, text_argument(arguments, "reason").strip())
+            log.warning("session %s is not used: %s", session_id, why)
             return self._table.summary(session_id)
 
     def shoot_command(self, arguments: Mapping[str, Any], *, most_off_mm: float = math.inf) -> dict[str, Any]:
@@ -284,7 +292,7 @@ class SessionManager:
         session = self._open
         if self._aim is None or session is None or not self._prisms.suspicions(session):
             return
-        if self.turn.acquire(blocking=False):  # otherwise a command is working on the session: retry later
+        if self.turn.enter_if_free():  # otherwise a command is working on the session: retry later
             try:
                 if session is self._open:
                     self._aim(session.prism)
@@ -292,7 +300,7 @@ class SessionManager:
             except (CommandError, sqlite3.Error) as error:  # a fault of the station or the disk: retry later
                 log.warning("the station could not be aimed at prism %s again: %s", session.prism, error)
             finally:
-                self.turn.release()
+                self.turn.leave()
 
     # ---- for a guide -------------------------------------------------------------------------------------------------
 

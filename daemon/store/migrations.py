@@ -12,6 +12,7 @@ import hashlib
 from sqlite_utils import Database, Migrations
 
 MIGRATIONS = Migrations("rigcal")
+_CALLER = ("caller_user TEXT", "caller_uid INTEGER", "caller_pid INTEGER")
 
 
 def _instant(prefix: str = "", *, optional: bool = False) -> str:
@@ -29,6 +30,10 @@ def _one_of(column: str, *allowed: str) -> str:
 def _create(db: Database, *statements: str) -> None:
     for statement in statements:
         db.execute(statement)
+
+
+def _add_columns(db: Database, table: str, prefix: str, *columns: str) -> None:
+    _create(db, *(f"ALTER TABLE {table} ADD COLUMN {prefix}{column}" for column in columns))
 
 
 @MIGRATIONS()
@@ -231,18 +236,14 @@ def m008_one_open_session(db: Database) -> None:
 @MIGRATIONS()
 def m009_uncontrolled_sessions(db: Database) -> None:
     """Sessions that calibration must not use, until an operator accepts them."""
+    # As for an observation: why calibration must not use it, NULL if it may. Decided when the session is closed.
+    _add_columns(db, "calibration_sessions", "", "excluded TEXT")
+    # An operator has accepted the session despite the reason in `excluded`; after_job: number of the newest job at that
+    # time, which did not use the session.
+    decision = ("by TEXT NOT NULL DEFAULT ''", *_instant(optional=True).split(", "), "after_job INTEGER")
+    _add_columns(db, "calibration_sessions", "accepted_", "despite TEXT", *decision)
     _create(
         db,
-        # As for an observation: why calibration must not use it, NULL if it may. Decided when the session is closed.
-        "ALTER TABLE calibration_sessions ADD COLUMN excluded TEXT",
-        # An operator has accepted the session despite the reason in `excluded`; after_job: number of the newest job at
-        # that time, which did not use the session.
-        "ALTER TABLE calibration_sessions ADD COLUMN accepted_despite TEXT",
-        "ALTER TABLE calibration_sessions ADD COLUMN accepted_by TEXT NOT NULL DEFAULT ''",
-        "ALTER TABLE calibration_sessions ADD COLUMN accepted_utc_ns INTEGER",
-        "ALTER TABLE calibration_sessions ADD COLUMN accepted_monotonic_ns INTEGER",
-        "ALTER TABLE calibration_sessions ADD COLUMN accepted_boot_id INTEGER REFERENCES boots(id)",
-        "ALTER TABLE calibration_sessions ADD COLUMN accepted_after_job INTEGER",
         "DROP INDEX calibration_sessions_by_kind",
         "CREATE INDEX calibration_sessions_used ON calibration_sessions(rig, state, kind) WHERE excluded IS NULL",
         """CREATE INDEX calibration_sessions_accepted ON calibration_sessions(rig, kind, accepted_after_job)
@@ -309,21 +310,12 @@ def m013_alarms(db: Database) -> None:
 @MIGRATIONS()
 def m014_who_said_so(db: Database) -> None:
     """The user whose process gave a command, as reported by the kernel, in addition to the operator it names."""
-    _create(
-        db,
-        # NULL if no command caused the row, and in rows from before this migration. caller_user: "" if the computer had
-        # no name for caller_uid.
-        *(
-            f"ALTER TABLE {table} ADD COLUMN {prefix}{column}"
-            for table, prefix in (
-                ("calibration_sessions", ""),
-                ("calibration_sessions", "accepted_"),
-                ("prism_confirmations", ""),
-                ("model_states", ""),
-            )
-            for column in ("caller_user TEXT", "caller_uid INTEGER", "caller_pid INTEGER")
-        ),
-    )
+    # NULL if no command caused the row, and in rows from before this migration. caller_user: "" if the computer had no
+    # name for caller_uid.
+    _add_columns(db, "calibration_sessions", "", *_CALLER)
+    _add_columns(db, "calibration_sessions", "accepted_", *_CALLER)
+    _add_columns(db, "prism_confirmations", "", *_CALLER)
+    _add_columns(db, "model_states", "", *_CALLER)
 
 
 @MIGRATIONS()
@@ -374,7 +366,7 @@ def m020_notices(db: Database) -> None:
 @MIGRATIONS()
 def m024_guides(db: Database) -> None:
     """Guided sessions: the request of each guide, and all its events, from which its state is derived."""
-    caller = "caller_user TEXT, caller_uid INTEGER, caller_pid INTEGER"
+    caller = ", ".join(_CALLER)
     _create(
         db,
         # taps: number of commands given to the guide.
@@ -435,6 +427,14 @@ def m030_rig_files(db: Database) -> None:
 def m031_states_of_devices(db: Database) -> None:
     """An index for the last event of each device, which is read at every start."""
     db.execute("CREATE INDEX device_events_of_states ON device_events(device, kind, boot_id, monotonic_ns)")
+
+
+@MIGRATIONS()
+def m032_rejected_sessions(db: Database) -> None:
+    """Closed sessions that an operator has rejected; accepted_after_job is set by both decisions on a session."""
+    # The instant is NULL unless the rejection stands.
+    decision = ("by TEXT NOT NULL DEFAULT ''", *_instant(optional=True).split(", "), *_CALLER)
+    _add_columns(db, "calibration_sessions", "rejected_", "reason TEXT", *decision)
 
 
 def unknown_migrations(db: Database) -> list[str]:

@@ -25,6 +25,9 @@ A command with an unknown argument, or without a required one, is refused with s
 marked as *read-only* changes something, and also accepts `operator`, the name of the responsible person. The name is
 stored with sessions, guides and decisions on models, and is logged for every command.
 
+Keep the connection open until the answer arrives. Commands on sessions and guides wait for one another, for example for
+the end of a shot, and a command whose client disconnects while it waits is not carried out.
+
 Read-only commands are also served on `status.sock`, in the same directory as the control socket, for members of
 `read_group`. [Guides on the socket](guide-socket.md) describes the answers of the `guide.*` commands and those of a
 simulated rig that is moved by hand.

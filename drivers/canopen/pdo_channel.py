@@ -73,7 +73,7 @@ class PdoChannelDecoder:
         return []
 
     def recall(self, event: DeviceEvent) -> bool:  # noqa: ARG002 - profiles use it
-        """Restore alarms or warnings from an event of an earlier decoder of the channel; True if any were restored."""
+        """Restore alarms or warnings from an event of an earlier decoder of the node; True if any were restored."""
         return False
 
     def node_restarted(self) -> None:

@@ -60,15 +60,16 @@ class NodeSupervision:
         """Restore the node's state from an event of an earlier decoder if its text names this node.
 
         Args:
-            event: event of a channel of the link; the node may have fed a different channel in an earlier rig file.
+            event: event of a channel that a node of this link may have fed, possibly in an earlier rig file.
 
         Returns:
-            The event under the node's current name; empty if it is about a different node or changes nothing.
+            The event under the current name of the node, or of each channel whose alarms or warnings it restores; empty
+            if it is about a different node or changes nothing.
         """
         if not event.text.startswith((f"node {self.node}:", f"node {self.node} ")):
             return []
         if event.kind in (EventKind.ALARM, EventKind.WARNING):
-            return [event for channel in self._channels if channel.name == event.device and channel.recall(event)]
+            return [replace(event, device=channel.name) for channel in self._channels if channel.recall(event)]
         if event.kind is EventKind.BOOT_UP:
             for channel in self._channels:
                 channel.node_restarted()

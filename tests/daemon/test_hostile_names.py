@@ -118,6 +118,7 @@ TEXTS = {
     "operator": ("session.start", {"prism": "r", "operator": None}),
     "session's note": ("session.start", {"prism": "r", "note": None}),
     "who accepts": ("session.accept", {"id": "s", "operator": None}),
+    "reason of a rejection": ("session.reject", {"id": "s", "reason": None}),
 }
 NAMES = {
     "set-up": ("setup.new", {"id": None}),

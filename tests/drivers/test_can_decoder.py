@@ -283,10 +283,12 @@ def test_what_a_node_told_is_its_own_whatever_channel_it_was_then() -> None:
     assert the_reading(feed(boom, "1A1 00 40 00 00")).status is Status.DEVICE_ALARM
 
 
-def test_what_a_node_of_another_link_told_says_nothing() -> None:
-    base = CanDecoder("base", [encoder("lift")])
-    assert base.recall([VOID]) == []
-    assert the_reading(feed(base, "1A0 00 40 00 00")).status is Status.OK
+@pytest.mark.parametrize("told", ["0A0 00 50 81 00 00 00 00 00", "5A0 4B 03 65 00 01 00 00 00"])
+def test_what_a_node_told_holds_when_its_channel_is_renamed(told: str) -> None:
+    renamed = CanDecoder("boom", [encoder("slew")])
+    (taken,) = renamed.recall(events(feed(decoder(), told)))
+    assert taken.device == "slew"
+    assert the_reading(feed(renamed, "1A0 00 40 00 00")).status is Status.DEVICE_ALARM
 
 
 def test_a_heartbeat_that_is_expected_no_more_is_not_missed() -> None:

@@ -63,7 +63,7 @@ def gain_meter_hangs(evidence: Evidence) -> Iterator[Finding]:
 def session_not_trained(evidence: Evidence) -> Iterator[Finding]:
     """Calibration does not use a closed session: control shots are missing at its start or end, or the station moved.
 
-    Cleared when an operator accepts the session, or when a newer session is used.
+    Cleared when an operator accepts or rejects the session, or when a newer session is used.
     """
     for name, why in evidence.untrained_sessions.items():
         yield name, f"calibration does not use the session: {why}"

@@ -12,7 +12,7 @@ from daemon.cli.client import ask, client_options, config_option, operator_optio
 from daemon.cli.command import Command, json_option
 from daemon.cli.lines.clock import latency_sentence
 from daemon.cli.lines.jobs import show_jobs
-from daemon.cli.lines.state import show_session
+from daemon.cli.lines.state import rejection, show_session
 from daemon.cli.terminal import echo, echo_error, echo_table
 from daemon.commands import SESSION_KINDS
 from daemon.control.protocol import request
@@ -80,9 +80,23 @@ def session_abort(**where: Any) -> Any:
 def session_accept(name: str, operator: str, **where: Any) -> Any:
     """Use a closed session that would not be used otherwise.
 
-    NAME is a session whose control points were not shot at both ends, or have moved.
+    NAME is a session whose control points were not shot at both ends, or have moved, or that was rejected.
     """
     return ask(where, "session.accept", show_session, id=name, operator=operator)
+
+
+@session.command(cls=Command, name="reject")
+@click.argument("name")
+@click.option("--reason", default="", help="Why, stored with the session.")
+@operator_option
+@client_options
+def session_reject(name: str, reason: str, operator: str, **where: Any) -> Any:
+    """Use a closed session no longer.
+
+    NAME is a session that turned out to be bad after its end, or was accepted by mistake. Training that has used it is
+    repeated without it. `rigcal session accept` takes this back.
+    """
+    return ask(where, "session.reject", show_session, id=name, operator=operator, reason=reason)
 
 
 @session.command(cls=Command, name="shoot")
@@ -281,7 +295,7 @@ def _show_list(sessions: Sequence[Mapping[str, Any]]) -> None:
             found["kind"],
             found["prism"],
             found["setup"],
-            found["state"] if found["not_used"] is None else f"{found['state']}, not used",
+            _use(found),
             str(found["poses"]),
             str(found["observations"]),
             who(found["operator"], found["user"]),
@@ -290,5 +304,14 @@ def _show_list(sessions: Sequence[Mapping[str, Any]]) -> None:
     ]
     echo_table(("session", "kind", "prism", "set-up", "state", "poses", "observations", "operator"), rows)
     for found in sessions:
-        if found.get("no_job"):
+        if found["rejected"] is not None:
+            echo(f"session {found['id']} was {rejection(found['rejected'])}")
+        elif found.get("no_job"):
             echo(f"session {found['id']} has no job of its own: {found['no_job']}")
+
+
+def _use(session: Mapping[str, Any]) -> str:
+    """Return the state of a session, and whether it is rejected or not used for other reasons."""
+    if session["rejected"] is not None:
+        return f"{session['state']}, rejected"
+    return str(session["state"]) if session["not_used"] is None else f"{session['state']}, not used"

@@ -123,10 +123,18 @@ def show_session(session: Mapping[str, Any]) -> None:
         echo("  the station has moved since this set-up was recorded", fg="red")
     if session["not_used"] is not None:
         echo(f"  {not_used(session['id'], session['not_used'])}", fg="red")
+    if session["rejected"] is not None:
+        echo(f"  {rejection(session['rejected'])}")
     if session["accepted"] is not None:
         accepted = session["accepted"]
         by = who(accepted["by"], accepted["user"]) or "an operator"
         echo(f"  accepted by {by}, although {accepted['despite']}")
+
+
+def rejection(rejected: Mapping[str, Any]) -> str:
+    """Return by whom, when and why a session was rejected, as the end of a sentence."""
+    by = who(rejected["by"], rejected["user"]) or "an operator"
+    return f"rejected by {by}, {utc(rejected['utc_ns'])}" + (f": {rejected['reason']}" if rejected["reason"] else "")
 
 
 # ---- models ----------------------------------------------------------------------------------------------------------

@@ -231,11 +231,20 @@ TABLES: dict[str, Words] = {
             "excluded": "why calibration must not use it; NULL if it may",
             "accepted_despite": "reason in `excluded` when an operator accepted it",
             "accepted_by": "operator who accepted it",
-            "accepted_after_job": "number of the newest job at that time, which did not use the session",
+            "accepted_after_job": "number of the newest job when an operator last accepted the session, or rejected it "
+            "although it was used; later jobs follow that decision",
+            "rejected_by": "operator who rejected it",
+            "rejected_reason": "why, if the operator said so",
             **_CALLER,
             **{f"accepted_{name}": f"of the acceptance: {meaning}" for name, meaning in _CALLER.items()},
+            **{f"rejected_{name}": f"of the rejection: {meaning}" for name, meaning in _CALLER.items()},
         },
-        {"started_": "start", "ended_": "end, NULL while it is open", "accepted_": "acceptance by an operator"},
+        {
+            "started_": "start",
+            "ended_": "end, NULL while it is open",
+            "accepted_": "acceptance by an operator",
+            "rejected_": "rejection by an operator, NULL unless it stands",
+        },
         label="id",
     ),
     "observations": Words(

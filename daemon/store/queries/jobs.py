@@ -30,7 +30,8 @@ _PENDING = """SELECT job.id, job.kind, job.session_id, job.state, job.attempts,
         LEFT JOIN jobs AS before ON before.id = job.depends_on
     WHERE job.state IN ('queued', 'running', 'interrupted') AND session.rig = ? ORDER BY job.id"""
 # Goes back from the newest session to one through which a job of this kind was queued, or that no longer matters. A job
-# that was queued before an operator accepted a session does not work on that session, and no longer covers anything.
+# that was queued before an operator accepted a session, or rejected a used one, does not work on the sessions that are
+# used now, and no longer covers anything.
 _COVERED = f"""SELECT session.rowid AS number FROM calibration_sessions AS session NOT INDEXED
     WHERE session.rig = ?1 AND session.rowid > ?2
         AND EXISTS (SELECT 1 FROM jobs WHERE jobs.through_session_id = session.id AND jobs.kind = ?3 AND jobs.id >

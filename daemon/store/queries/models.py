@@ -31,9 +31,11 @@ _LIVE_RUN = """SELECT state.id AS since, model.id AS model_id, coalesce(state.af
     ORDER BY state.id DESC LIMIT 1"""
 _DRIFTED = """SELECT session.rowid AS number, session.id FROM drift_checks AS drift
     CROSS JOIN calibration_sessions AS session ON session.id = drift.session_id
-    WHERE drift.live_since = ? AND drift.alarm = 'worse' ORDER BY drift.id LIMIT 1"""
-_DRIFT_CHECKS = """SELECT session_id, standstills, ratio, reason, upper, lower, alarm FROM drift_checks
-    WHERE live_since = ? ORDER BY id"""
+    WHERE drift.live_since = ? AND drift.alarm = 'worse' AND session.rejected_utc_ns IS NULL
+    ORDER BY drift.id LIMIT 1"""
+_DRIFT_CHECKS = """SELECT drift.session_id, standstills, ratio, reason, upper, lower, alarm FROM drift_checks AS drift
+    CROSS JOIN calibration_sessions AS session ON session.id = drift.session_id
+    WHERE live_since = ? AND session.rejected_utc_ns IS NULL ORDER BY drift.id"""
 
 
 @dataclass(frozen=True)

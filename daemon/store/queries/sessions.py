@@ -33,6 +33,7 @@ _UNFINISHED = f"SELECT * FROM calibration_sessions WHERE state = 'open' OR {_IS_
 _SUMMARY = """SELECT id, rig, setup_id AS setup, prism, operator, caller_user AS user, kind, state, note,
         started_utc_ns, ended_utc_ns, excluded AS not_used, accepted_despite, accepted_by, accepted_utc_ns,
         accepted_caller_user AS accepted_user,
+        rejected_reason, rejected_by, rejected_caller_user AS rejected_user, rejected_utc_ns,
         (SELECT state = 'moved' FROM station_setups WHERE station_setups.id = setup_id) AS setup_moved
     FROM calibration_sessions WHERE id = ?"""
 _SHOTS = "SELECT name AS point, phase, misclosure_mm FROM control_shots WHERE session_id = ? ORDER BY id"
@@ -90,7 +91,7 @@ _STANDSTILLS = """SELECT id, session_id, prism, x_mm, y_mm, z_mm, values_json FR
     SELECT max(id) AS newest FROM (SELECT o.id, o.session_id, o.pose
             FROM calibration_sessions AS s CROSS JOIN observations AS o ON o.session_id = s.id
             WHERE s.setup_id = ? AND s.rig = ? AND s.state != 'aborted' AND o.excluded IS NULL AND o.pose IS NOT NULL
-                AND coalesce(s.excluded, '') NOT LIKE ?
+                AND s.rejected_utc_ns IS NULL AND coalesce(s.excluded, '') NOT LIKE ?
                 AND (o.boot_id, o.monotonic_ns) >= (?, ?)
             ORDER BY s.rowid DESC, o.boot_id DESC, o.monotonic_ns DESC LIMIT 50000)
         GROUP BY session_id, pose ORDER BY newest DESC LIMIT 500)
@@ -98,7 +99,7 @@ _STANDSTILLS = """SELECT id, session_id, prism, x_mm, y_mm, z_mm, values_json FR
 # Sessions after the newest used session; later measurements replace earlier ones.
 _UNTRAINED = f"""SELECT id, excluded FROM calibration_sessions
     WHERE rig = ?1 AND state = 'closed' AND excluded IS NOT NULL AND excluded NOT LIKE '{OTHER_RIG_FILE}%'
-        AND excluded NOT LIKE '{ZERO_LOST}%' AND rowid >
+        AND excluded NOT LIKE '{ZERO_LOST}%' AND rejected_utc_ns IS NULL AND rowid >
         (SELECT coalesce(max(number), 0) FROM ({_USED}) WHERE rig = ?1)
     ORDER BY rowid"""
 _WITH_RIG = """SELECT calibration_sessions.*, rig_files.text AS rig_text FROM calibration_sessions
@@ -227,7 +228,8 @@ class SessionTable:
     def untrained(self) -> dict[str, str]:
         """Return the rig's closed sessions newer than all used ones that calibration does not use -> why.
 
-        Sessions recorded with a different rig file, or before a joint's zero was lost, are left out as outdated.
+        Sessions recorded with a different rig file, or before a joint's zero was lost, are left out as outdated, and so
+        are sessions that an operator has rejected.
         """
         return {row["id"]: row["excluded"] for row in self._store.rows(_UNTRAINED, (self._rig,))}
 
@@ -325,7 +327,7 @@ class SessionTable:
     def standstill_observations(self, setup_id: str, since: Stamp | None) -> list[dict[str, Any]]:
         """Return the newest used observation of each standstill in a set-up, oldest first.
 
-        Sessions that were recorded with a different rig file are left out.
+        Sessions that were recorded with a different rig file, or rejected by an operator, are left out.
 
         Args:
             setup_id: set-up of the station.
@@ -401,6 +403,7 @@ def _summary(source: RowSource, session_id: str, count: Callable[[RowSource, str
     if row is None:
         raise _unknown(session_id)
     accepted = {key: row.pop(f"accepted_{key}") for key in ("despite", "by", "user", "utc_ns")}
+    rejected = {key: row.pop(f"rejected_{key}") for key in ("reason", "by", "user", "utc_ns")}
     tally = count(source, session_id)
     steps = _clock_steps(source, tally)
     return {
@@ -409,6 +412,7 @@ def _summary(source: RowSource, session_id: str, count: Callable[[RowSource, str
         "poses": len(tally.poses),
         "setup_moved": bool(row["setup_moved"]),
         "accepted": accepted if accepted["despite"] is not None else None,
+        "rejected": rejected if rejected["utc_ns"] is not None else None,
         "excluded": dict(sorted(tally.excluded.items(), key=lambda item: (-item[1], item[0]))),
         "control_shots": list(source.rows(_SHOTS, (session_id,))),
         "clock": _clocks(source, session_id),

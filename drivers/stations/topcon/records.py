@@ -40,6 +40,10 @@ _COORDINATES = re.compile(
     r"(?P<n>[+-]\d+)(?P<e>[+-]\d+)(?P<z>[+-]\d+)(?P<unit>[mfi])(?P<h>[+-]\d{7,8})(?P<angle>[dg])"
 )
 
+_TILT_UNCORRECTED = {
+    "?": "the compensator is out of range: level the instrument",
+    "*": "the compensator is off: switch it on",
+}
 _TRACKING_FLAG = {
     0: (LockState.STANDBY, "tracking is switched off"),
     1: (LockState.LOCKED, ""),
@@ -82,7 +86,7 @@ def parse_record(
 
     Returns:
         A fix; its status is NOT_AVAILABLE if there is no distance or the station is not locked, and OUT_OF_RANGE if the
-        compensator is out of range.
+        compensator is out of range or off, because its angles are then not corrected for the instrument's tilt.
 
     Raises:
         RecordError: the data does not follow the layout for its header, or is inconsistent.
@@ -133,8 +137,8 @@ def _slope(make: Callable[..., Fix], match: re.Match[str], counts_per_unit: int,
         status, reason = Status.NOT_AVAILABLE, "no distance"
     else:
         check_horizontal_distance(slope_m, zenith, _metres(match["hd"], match["unit"], counts_per_unit))
-        if match["tilt"] == "?":
-            status, reason = Status.OUT_OF_RANGE, "the compensator is out of range: level the instrument"
+        if match["tilt"] in _TILT_UNCORRECTED:
+            status, reason = Status.OUT_OF_RANGE, _TILT_UNCORRECTED[match["tilt"]]
     return make(
         status=status,
         lock=LockState.UNKNOWN,
@@ -144,25 +148,22 @@ def _slope(make: Callable[..., Fix], match: re.Match[str], counts_per_unit: int,
         face=face_of(zenith),
         prism_constant_mm=int(match["prism"]) * scales.prism_mm,
         ppm=int(match["ppm"]) * scales.ppm,
-        tilt_ok=match["tilt"] == "t",
+        tilt_ok=match["tilt"] not in _TILT_UNCORRECTED,
         edm_level=None if match["level"] == "**" else int(match["level"]),
         reason=reason,
     )
 
 
 def _tracking(make: Callable[..., Fix], match: re.Match[str], scales: CorrectionScales) -> Fix:
-    """Parse `Q`: usable if the tracking flag is "locked", there is a distance, and the compensator is on and in range.
+    """Parse `Q`: usable if the tracking flag is "locked" as well.
 
     The face is derived from the zenith angle, from which the position is computed, and not from the `r`/`l` flag.
     """
     fix = _slope(make, match, 10_000, scales)
     lock, why_not = _TRACKING_FLAG.get(int(match["flag"]), (LockState.UNKNOWN, "unknown tracking flag"))
-    status, reason = fix.status, fix.reason
-    if lock is not LockState.LOCKED:
-        status, reason = Status.NOT_AVAILABLE, f"{why_not} (flag {match['flag']})"
-    elif status is Status.OK and match["tilt"] == "*":
-        status, reason = Status.OUT_OF_RANGE, "the compensator is off: switch it on (ZB52)"
-    return replace(fix, status=status, lock=lock, reason=reason)
+    if lock is LockState.LOCKED:
+        return replace(fix, lock=lock)
+    return replace(fix, status=Status.NOT_AVAILABLE, lock=lock, reason=f"{why_not} (flag {match['flag']})")
 
 
 def _angles(make: Callable[..., Fix], match: re.Match[str]) -> Fix:

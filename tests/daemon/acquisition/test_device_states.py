@@ -32,10 +32,14 @@ HARDWARE, OVERRUN, TAKEN_BACK = (
 )
 
 
-def boom() -> CanDecoder:
+def can_link(name: str, channel: str) -> CanDecoder:
     return CanDecoder(
-        "boom", [EncoderDecoder(EncoderChannel(name="theta1", node=32, pdo=TransmitPdo.from_eds(EDS, 32, 1)))]
+        name, [EncoderDecoder(EncoderChannel(name=channel, node=32, pdo=TransmitPdo.from_eds(EDS, 32, 1)))]
     )
+
+
+def boom() -> CanDecoder:
+    return can_link("boom", "theta1")
 
 
 DECODERS = {"boom": boom}
@@ -64,6 +68,21 @@ def test_values_that_were_void_before_a_restart_are_void_after_it(
     acquire([], DECODERS).run_inline([capture(text, second) for second, text in enumerate(before)])
     acquire([], DECODERS).run_inline([capture(text, 50 + second) for second, text in enumerate([*after, PDO])])
     assert statuses(store) == [status]
+
+
+def test_values_stay_void_if_their_channel_is_renamed_in_the_rig_file(store: Store, acquire: Make) -> None:
+    store.declare_channels({"theta1": "deg", "theta4": "deg"}, {})
+    acquire([], DECODERS).run_inline([capture(HARDWARE)])
+    acquire([], {"boom": lambda: can_link("boom", "theta4")}).run_inline([capture(PDO, 50)])
+    assert statuses(store) == ["device_alarm"]
+
+
+def test_a_node_of_the_same_number_on_another_link_is_not_void(store: Store, acquire: Make) -> None:
+    store.declare_channels({"theta1": "deg", "theta3": "deg"}, {})
+    links = {**DECODERS, "base": lambda: can_link("base", "theta3")}
+    acquire([], links).run_inline([capture(HARDWARE)])
+    acquire([], links).run_inline([replace(capture(PDO, 50), link="base"), capture(PDO, 51)])
+    assert statuses(store) == ["ok", "device_alarm"]
 
 
 def test_frames_that_were_read_at_once_are_recalled_in_their_order(store: Store, acquire: Make) -> None:

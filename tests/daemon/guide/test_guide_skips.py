@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from daemon.commands import CommandError
+from daemon.commands import CommandError, acting_for
 from tests.daemon.guide.test_guide_store_order import POSE
 from tests.daemon.guide.test_guide_warnings import WatchedRig
 from tests.daemon.support.sessions import STEP_S, closed_afterwards
@@ -129,7 +129,8 @@ def test_a_button_that_is_pressed_while_the_shot_of_an_earlier_step_ends_is_not_
 
     def shoot(*_arguments: Any, **_more: Any) -> dict[str, Any]:
         rig.guide._course.happen("skipped", {"reason": "fog"})
-        rig.guided("done")
+        with acting_for(None):  # a command of the operator, who is connected
+            rig.guided("done")
         raise CommandError("the shot was cancelled, and nothing was stored")
 
     monkeypatch.setattr(rig.keeper, "shoot_command", shoot)

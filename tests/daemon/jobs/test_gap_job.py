@@ -105,6 +105,17 @@ def test_drifted_checks_trigger_a_proposal_made_from_all_sessions_and_that_once(
     assert (compared["session_ids"], compared["model"]) == (["c3"], str(proposal.path))
 
 
+def test_a_rejected_check_shows_no_drift(rig: JobRig) -> None:
+    with_live_model(rig)
+    rig.plan(drift=f"scores {CLIP} {CLIP}")
+    check(rig, "c1", jobs=7)
+    before = drift(rig)
+    check(rig, "c2", jobs=14)
+    assert drift(rig)["drifted_with"] == "c2"
+    rig.store.update("calibration_sessions", {"id": "c2"}, {"excluded": "it was rejected", "rejected_utc_ns": 1})
+    assert drift(rig) == before
+
+
 def test_the_sums_begin_anew_with_each_model_that_goes_live(rig: JobRig) -> None:
     models = with_live_model(rig)
     rig.plan(drift=f"scores {CLIP} {CLIP}")

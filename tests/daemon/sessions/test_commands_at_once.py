@@ -1,15 +1,22 @@
-"""A session's command that stores several things stores all of them or none, whatever the disk refuses."""
+"""A session's command stores all of its things or none, whatever the disk refuses, and none if its caller has left."""
 
 from __future__ import annotations
 
 import contextlib
+import json
+import socket
 import sqlite3
 import threading
+import time
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
 
+from daemon.commands import CommandError, CommandTurn, acting_for
+from daemon.control.server import ControlServer
 from daemon.store.queries.observations import OF_CONTROL_POINT
 from tests.daemon.support.damage import fill_up, make_room
 from tests.daemon.support.sessions import STEP_S, Rig, disk_fails
@@ -122,3 +129,71 @@ def tell_a_fix_of_the_far_future(rig: Rig) -> None:
     rig.clock.advance(STEP_S / 2)
     fix = rig.fix()
     rig.keeper.on_records([replace(fix, stamp=replace(fix.stamp, utc_ns=2**63))])
+
+
+# ---- callers that leave ----------------------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def a_shot_that_waits(rig: Rig) -> Iterator[None]:
+    """Another client shoots a control point, whose fixes arrive at the end of the block."""
+    shooting = threading.Thread(target=rig.say, args=("shoot",), kwargs={"point": "cp1"})
+    shooting.start()
+    while rig.keeper.turn.enter_if_free():
+        rig.keeper.turn.leave()
+        time.sleep(0.01)
+    try:
+        yield
+    finally:
+        rig.target_mm = POINT_MM
+        while shooting.is_alive():
+            rig.live(STEP_S)
+
+
+@pytest.mark.parametrize("command", ["abort", "stop", "confirm_prism"])
+def test_a_command_whose_caller_leaves_while_it_waits_for_a_shot_is_not_carried_out(
+    session_rig: Rig, tmp_path: Path, command: str
+) -> None:
+    began, ended = threading.Event(), threading.Event()
+
+    def carry_out(arguments: Mapping[str, Any]) -> Any:
+        began.set()
+        try:
+            return session_rig.say(command, **arguments)
+        finally:
+            ended.set()
+
+    session_rig.say("start", prism="r")
+    session_rig.live(1)
+    server = ControlServer(tmp_path / "s", {command: carry_out})
+    try:
+        with a_shot_that_waits(session_rig):
+            with socket.socket(socket.AF_UNIX) as client:
+                client.connect(str(tmp_path / "s"))
+                client.sendall(json.dumps({"command": command}).encode() + b"\n")
+                assert began.wait(10)
+            assert ended.wait(10), "it does not wait for the end of the shot"
+    finally:
+        server.close()
+    opened = session_rig.keeper.open_session()
+    assert opened is not None
+    assert opened["state"] == "open"
+    assert len(opened["control_shots"]) == 1
+    assert table(session_rig.store.path, "prism_confirmations") == []
+
+
+def test_a_command_whose_caller_has_left_before_its_turn_is_not_carried_out(session_rig: Rig) -> None:
+    session_rig.say("start", prism="r")
+    with acting_for(None, lambda: True), pytest.raises(CommandError, match="its caller has disconnected"):
+        session_rig.say("abort")
+    assert session_rig.keeper.open_session() is not None
+    assert session_rig.say("abort")["state"] == "aborted", "the next one gets its turn"
+
+
+def test_a_command_that_has_its_turn_keeps_it_when_its_caller_leaves() -> None:
+    turn, has_left = CommandTurn(), threading.Event()
+    with acting_for(None, has_left.is_set), turn:
+        has_left.set()
+        with turn:
+            pass
+    assert turn.enter_if_free()

@@ -15,8 +15,9 @@ from daemon.jobs.job_queue import JobQueue
 from daemon.jobs.order import Order, Outcome
 from daemon.jobs.scheduler import CHAIN, CHECKS, DueChain, due_jobs, next_job
 from daemon.store.errors import NotInStoreError
+from daemon.store.queries.sessions import SessionTable
 from drivers.clock import NS_PER_S
-from tests.daemon.support.sessions import Rig, controlled
+from tests.daemon.support.sessions import SOURCE, Rig, controlled
 
 CP1 = (9000.0, 500.0, 2000.0)
 ELSEWHERE = (9000.0, 520.0, 2000.0)
@@ -261,6 +262,80 @@ def test_what_cannot_be_accepted_is_refused_in_a_sentence(session_rig: Rig, name
         session_rig.say("accept", id=name)
 
 
+# ---- what is rejected ------------------------------------------------------------------------------------------------
+
+
+def test_a_rejected_session_is_used_by_no_job_and_who_said_so_is_kept(session_rig: Rig) -> None:
+    good, bad = controlled(session_rig), controlled(session_rig)
+    told = session_rig.say("reject", id=bad, operator="Ada", reason="measured on w")
+    assert told["not_used"] == "it was rejected by Ada: measured on w"
+    now_ns = session_rig.clock.now().utc_ns
+    assert told["rejected"] == {"reason": "measured on w", "by": "Ada", "user": None, "utc_ns": now_ns}
+    assert [order.session_ids for order in Jobs(session_rig).run() if order.kind == "gap"] == [(good,)]
+    table = SessionTable(session_rig.store, SOURCE.rig.name)
+    assert table.untrained() == {}, "the operator knows"
+    session_rig.keeper = session_rig.new_keeper()
+    assert session_rig.say("show", id=bad)["not_used"] == told["not_used"], "also after a restart"
+
+
+def test_a_rejected_session_shows_nothing_about_the_prism_of_the_next_one(session_rig: Rig) -> None:
+    bad = controlled(session_rig, seconds=5.0)
+    table = SessionTable(session_rig.store, SOURCE.rig.name)
+    assert {row["session_id"] for row in table.standstill_observations("S1", None)} == {bad}
+    session_rig.say("reject", id=bad)
+    assert table.standstill_observations("S1", None) == []
+
+
+def test_training_that_used_a_session_is_repeated_without_it_when_it_is_rejected(session_rig: Rig) -> None:
+    good, bad = controlled(session_rig), controlled(session_rig)
+    jobs = Jobs(session_rig)
+    assert [order.session_ids for order in jobs.run() if order.kind == "gap"] == [(good, bad)]
+    session_rig.say("reject", id=bad)
+    assert jobs.due() == [DueChain(CHAIN, good, good)]
+    assert [order.session_ids for order in jobs.run() if order.kind == "gap"] == [(good,)]
+    assert jobs.due() == []
+    session_rig.say("accept", id=bad)
+    assert [order.session_ids for order in jobs.run() if order.kind == "gap"] == [(good, bad)]
+
+
+def test_nothing_is_repeated_when_a_session_that_no_job_used_is_rejected(session_rig: Rig) -> None:
+    controlled(session_rig)
+    unused = uncontrolled(session_rig)
+    jobs = Jobs(session_rig)
+    jobs.run()
+    session_rig.say("reject", id=unused)
+    assert jobs.due() == []
+
+
+def test_an_acceptance_is_taken_back_by_a_rejection_and_a_rejection_by_an_acceptance(session_rig: Rig) -> None:
+    name = uncontrolled(session_rig)
+    session_rig.say("accept", id=name, operator="Ada")
+    rejected = session_rig.say("reject", id=name, operator="Ben")
+    assert rejected["not_used"].startswith("it was rejected by Ben; no control point was shot")
+    assert rejected["accepted"] is None
+    accepted = session_rig.say("accept", id=name, operator="Ada")
+    assert accepted["not_used"] is accepted["rejected"] is None
+    assert accepted["accepted"]["despite"] == rejected["not_used"]
+
+
+@pytest.mark.parametrize(
+    ("name", "why"),
+    [
+        ("nothing", "there is no session 'nothing'"),
+        ("s001-r", "session 's001-r' was aborted, and is never used"),
+        ("s002-r", "session 's002-r' is already rejected"),
+        ("s003-r", "session 's003-r' is open; abort it: `rigcal session abort`"),
+    ],
+)
+def test_what_cannot_be_rejected_is_refused_in_a_sentence(session_rig: Rig, name: str, why: str) -> None:
+    session_rig.say("start", prism="r")
+    session_rig.say("abort")
+    session_rig.say("reject", id=controlled(session_rig))
+    session_rig.say("start", prism="r")
+    with pytest.raises((CommandError, NotInStoreError), match=why):
+        session_rig.say("reject", id=name)
+
+
 def test_sessions_of_an_older_store_are_used_as_before(session_rig: Rig) -> None:
     """What was trained on before this rule was there needs no operator's word."""
     name = uncontrolled(session_rig)
@@ -274,7 +349,7 @@ def test_sessions_of_an_older_store_are_used_as_before(session_rig: Rig) -> None
 def test_people_are_told_that_a_session_is_not_used_and_what_to_type(session_rig: Rig, tmp_path: Path) -> None:
     handlers = {
         f"session.{name}": getattr(session_rig.keeper, f"{name}_command")
-        for name in ("stop", "show", "list", "accept", "shoot")
+        for name in ("stop", "show", "list", "accept", "reject", "shoot")
     }
     server = ControlServer(tmp_path / "s", handlers)
 
@@ -295,6 +370,14 @@ def test_people_are_told_that_a_session_is_not_used_and_what_to_type(session_rig
         told: Any = rigcal("session", "accept", "s001-r", "--operator", "Ada")
         assert re.search(r"accepted by Ada \(user \S+\), although no control point was shot", told)
         assert "does not use" not in told
+        for text in (
+            rigcal("session", "reject", "s001-r", "--operator", "Ben", "--reason", "fog"),
+            rigcal("session", "show", "s001-r"),
+            rigcal("session", "list"),
+        ):
+            assert re.search(r"rejected by Ben \(user \S+\), 20\d\d-\d\d-\d\d \S+ UTC: fog", text), text
+        assert "closed, rejected" in rigcal("session", "list")
+        assert "although it was rejected by Ben: fog" in rigcal("session", "accept", "s001-r", "--operator", "Ada")
     finally:
         server.close()
 

@@ -50,6 +50,22 @@ def older_store(path: Path) -> None:
     db.close()
 
 
+def test_no_session_of_an_older_store_is_rejected_and_what_was_accepted_stays_accepted(tmp_path: Path) -> None:
+    path = tmp_path / "rigcal.sqlite"
+    db = Database(path)
+    MIGRATIONS.apply(db, stop_before="m032_rejected_sessions")
+    db["boots"].insert({"id": 1, "kernel_boot_id": "a", "booted_utc_ns": 0})
+    db["rig_files"].insert({"sha256": "a", "rig": "swdt82", "text": "one"})
+    row = {"id": "s1", "rig": "swdt82", "rig_sha256": "a", "prism": "r", "operator": "", "kind": "static_poses"}
+    row |= {"state": "closed", "started_utc_ns": 1, "started_monotonic_ns": 1, "started_boot_id": 1}
+    db["calibration_sessions"].insert({**row, "accepted_despite": "it stood", "accepted_by": "Ada"})
+    db.close()
+    with contextlib.closing(Store(path)) as store:
+        summary = SessionTable(store, "swdt82").summary("s1")
+    assert (summary["rejected"], summary["not_used"]) == (None, None)
+    assert summary["accepted"]["by"] == "Ada"
+
+
 def test_rig_files_of_an_older_store_are_moved(tmp_path: Path) -> None:
     path = tmp_path / "rigcal.sqlite"
     older_store(path)

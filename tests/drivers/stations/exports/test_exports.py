@@ -30,9 +30,11 @@ POINTS = [
 SETUP = "_'_(_)1.540"
 
 
-def gts_record(slope_mm: int, zenith_gon: float, hz_gon: float, corrections: str = "+00+00") -> str:
+def gts_record(slope_mm: int, zenith_gon: float, hz_gon: float, corrections: str = "+00+00", *, tilt: str = "t") -> str:
     level_mm = round(slope_mm * math.sin(math.radians(zenith_gon * 0.9)))
-    data = f"?+{slope_mm:08d}m{round(zenith_gon * 1e4):07d}+{round(hz_gon * 1e4):07d}g+{level_mm:08d}t**{corrections}"
+    data = (
+        f"?+{slope_mm:08d}m{round(zenith_gon * 1e4):07d}+{round(hz_gon * 1e4):07d}g+{level_mm:08d}{tilt}**{corrections}"
+    )
     return data + block_check(data.encode()).decode()
 
 
@@ -94,6 +96,12 @@ def test_a_gts_point_has_the_prism_constant_of_its_record() -> None:
     data = [fields[at : at + 128].ljust(128) + str(at // 128) for at in range(0, len(fields), 128)]
     text = "".join(f"\x02{block}{block_check(block.encode()).decode()}\x03\n" for block in data) + "\x04\n"
     assert [fix.prism_constant_mm for fix in fixes(text, "topcon_gts")] == [0.0, -30.0]
+
+
+def test_a_gts_download_with_a_point_measured_while_the_compensator_was_off_is_refused() -> None:
+    block = f"{SETUP}_+1_ {gts_record(8000, 100.0, 10.0, tilt='*')}_".ljust(128) + "0"
+    text = f"\x02{block}{block_check(block.encode()).decode()}\x03\n\x04\n"
+    assert "point 1: the compensator is off" in refused(text)
 
 
 def test_a_gts_download_of_more_than_ten_blocks() -> None:

@@ -130,22 +130,21 @@ def test_distance_zero_means_no_distance() -> None:
     assert position_mm(fix) is None
 
 
-def test_a_compensator_out_of_range_makes_a_fix_unusable() -> None:
+@pytest.mark.parametrize(
+    ("tilt", "reason"), [(b"?", "out of range: level the instrument"), (b"*", "off: switch it on")]
+)
+def test_fixes_of_every_record_kind_are_unusable_while_the_compensator_is_off_or_out_of_range(
+    tilt: bytes, reason: str
+) -> None:
     for data in (
-        with_field(SLOPE_MM, 36, b"?"),
-        with_field(SLOPE_FINE, 40, b"?"),
-        with_field(TRACKING[:40] + b"?" + TRACKING[41:], 54, b"1"),
+        with_field(SLOPE_MM, 36, tilt),
+        with_field(SLOPE_FINE, 40, tilt),
+        with_field(TRACKING[:40] + tilt + TRACKING[41:], 54, b"1"),
     ):
         fix = parsed(data)
         assert (fix.status, fix.tilt_ok) == (Status.OUT_OF_RANGE, False)
-        assert "compensator" in fix.reason
-
-
-def test_a_compensator_switched_off_is_refused_of_a_tracking_station_and_noted_of_a_classic_one() -> None:
-    tracking = parsed(with_field(TRACKING[:40] + b"*" + TRACKING[41:], 54, b"1"))
-    assert (tracking.status, tracking.tilt_ok) == (Status.OUT_OF_RANGE, False)
-    classic = parsed(with_field(SLOPE_MM, 36, b"*"))
-    assert (classic.status, classic.tilt_ok) == (Status.OK, False)
+        assert fix.reason == f"the compensator is {reason}"
+        assert position_mm(fix) is None
 
 
 def test_a_return_level_of_asterisks_is_none() -> None:
