@@ -11,7 +11,7 @@ import logging
 import math
 import sqlite3
 import threading
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -62,8 +62,8 @@ class SessionManager:
         settings: tolerances and timeouts.
         clock: clock of the rig.
         run_id: number of this run of the daemon; poses are numbered within a run.
+        limits: station -> limits of its prism's motion, for each configured station.
         aim: turns the station to a prism or control point, on a simulated rig; None where the operator does it.
-        limits: station -> limits of its prism's motion.
         are_jobs_enabled: closed sessions start jobs.
         clock_state: returns the state of the computer's clock, noted with a session; None for a different clock.
 
@@ -83,8 +83,8 @@ class SessionManager:
         clock: Clock,
         *,
         run_id: int,
+        limits: Mapping[str, MotionLimit],
         aim: Callable[[str], None] | None = None,
-        limits: Mapping[str, MotionLimit] | None = None,
         are_jobs_enabled: bool = True,
         clock_state: Callable[[], ClockState | None] = lambda: None,
     ) -> None:
@@ -98,14 +98,14 @@ class SessionManager:
         self.turn = threading.RLock()
         self._shot: Shot | None = None
         self._pending = PendingWrites(store)
-        self._prisms = PrismWatch(store, rig, clock, limits or {}, self._pending.add_event)
+        self._prisms = PrismWatch(store, rig, clock, limits, self._pending.add_event)
         self._observing = ObservationMaker(rig, store, self._observations, self._pending, self._prisms, run_id)
         self._advice = SessionAdvice(rig, setups, self._table, self._prisms)
         self._late: set[str] = set()  # sessions that got fixes after their end, and must be judged again
         # Fixes measured in ended sessions may still arrive, or wait for their joints
         self._open: OpenSession | None = None
         self._ended: list[OpenSession] = []
-        store.unless_damaged(self._go_on, None)
+        store.unless_damaged(partial(self._go_on, limits), None)
 
     # ---- the writer thread -------------------------------------------------------------------------------------------
 
@@ -417,9 +417,9 @@ class SessionManager:
             raise CommandError("no session is open; start one with `rigcal session start`")
         return self._open
 
-    def _go_on(self) -> None:
+    def _go_on(self, stations: Collection[str]) -> None:
         """Resume the sessions of an earlier run: the open one, and ended ones whose captures were not all decoded."""
-        self._open, self._ended = self._lifecycle.unfinished(self._rig_text)
+        self._open, self._ended = self._lifecycle.unfinished(self._rig_text, stations)
         self._lifecycle.judge_readings()
         for session in self._taking():
             session.know(self._setups.control_points(session.setup_id), first_constants_mm(self._store, session.id))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -10,15 +9,11 @@ import pytest
 from click.testing import CliRunner
 
 from calibration.rig.description import shipped_rig
-from daemon.acquisition.joiner import ObservationJoiner, joint_inputs
 from daemon.cli.main import main
 from daemon.commands import CommandError
 from daemon.config.config import parse_config
-from daemon.config.sections import SessionsSection
 from daemon.sessions.export.captured_logs import export_session
 from daemon.sessions.export.session_file import SessionFile, read_session_file
-from daemon.sessions.manager import SessionManager
-from daemon.sessions.prisms.guard import MotionLimit
 from daemon.sessions.prisms.standstill_places import ELSEWHERE
 from daemon.store.queries.observations import moving_observations
 from daemon.store.reader import Reader
@@ -30,7 +25,7 @@ from simulators.devices.stations.total_station import StationSettings
 from simulators.faults import parse_faults
 from simulators.rig.truth import RigTruth
 from simulators.rig_simulator import RigSimulator, SimulatorSettings
-from tests.daemon.sessions.test_sessions import SOURCE, Rig, start
+from tests.daemon.sessions.test_sessions import Rig, start
 from tests.daemon.support.sessions import STEP_S, closed_afterwards, disk_fails
 from tests.daemon.support.store import table
 from tests.simulated.captures import Step, generate
@@ -52,26 +47,7 @@ NEARER_MM = (6000.0, 8000.0, 1000.0)  # one fix a second does not show this jump
 CONTROL_MM = (9000.0, 500.0, 2000.0)
 
 
-class WatchedRig(Rig):
-    """A rig whose configuration names its station."""
-
-    def new_keeper(self, aim: Callable[[str], None] | None = None) -> SessionManager:
-        self.runs += 1
-        return SessionManager(
-            SOURCE.rig,
-            SOURCE.text,
-            self.store,
-            self.setups,
-            ObservationJoiner(joint_inputs(SOURCE.rig), settle_s=0.5),
-            SessionsSection(fixes_per_shot=3),
-            self.clock,
-            run_id=self.runs,
-            aim=aim,
-            limits={"station": MotionLimit()},
-        )
-
-
-rig = closed_afterwards(WatchedRig)
+rig = closed_afterwards(Rig)
 
 
 def used(rig: Rig) -> list[float]:

@@ -306,6 +306,27 @@ def test_an_open_session_survives_the_daemon(rig: Rig) -> None:
     assert rig.say("stop")["id"] == "s001-r"
 
 
+def test_an_open_session_ends_where_its_station_is_not_configured_any_more(rig: Rig) -> None:
+    """What is known of the target of one station does not apply to another, nor to one of another name."""
+    start(rig)
+    rig.live(3)
+    rig.target_mm = (9000.0, 8000.0, 1000.0)
+    rig.live(1)
+    rig.stations = ("station", "topcon")
+    rig.keeper = rig.new_keeper()
+    assert len(rig.keeper.prism_suspicions()) == 1, "another station that is added changes nothing"
+    rig.stations = ("topcon",)
+    rig.keeper = rig.new_keeper()
+    assert rig.keeper.open_session() is None
+    rig.live(2)
+    (closed,) = rig.say("list")
+    assert closed["note"] == (
+        "closed by rigcal: station station was removed from the configuration or renamed while it was open"
+    )
+    rows = rig.store.rows("SELECT x_mm FROM observations WHERE excluded IS NULL")
+    assert {round(row["x_mm"]) for row in rows} == {3000}
+
+
 def test_control_points_that_hold_say_so(rig: Rig) -> None:
     start(rig)
     assert rig.shoot("cp1", (9000.0, 500.0, 2000.0))["misclosure_mm"] is None
