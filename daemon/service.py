@@ -107,6 +107,7 @@ class Daemon:
             aim=parts.aim,
             are_jobs_enabled=config.jobs.enabled,
             clock_state=lambda: None if self._time is None else self._time.state,
+            why_no_fix=lambda: self._acquisition.status().why_no_fix(),
         )
         models = ModelTable(store, parts.rig.name, parts.clock)
         self._live_model = LiveModel(models, parts.rig)

@@ -66,6 +66,7 @@ class SessionManager:
         aim: turns the station to a prism or control point, on a simulated rig; None where the operator does it.
         are_jobs_enabled: closed sessions start jobs.
         clock_state: returns the state of the computer's clock, noted with a session; None for a different clock.
+        why_no_fix: returns why no fix can arrive at present, a clause; None if fixes can arrive.
 
     Attributes:
         turn: lock that is held while a command is carried out. A caller that runs several commands in one transaction
@@ -87,6 +88,7 @@ class SessionManager:
         aim: Callable[[str], None] | None = None,
         are_jobs_enabled: bool = True,
         clock_state: Callable[[], ClockState | None] = lambda: None,
+        why_no_fix: Callable[[], str | None] = lambda: None,
     ) -> None:
         self._rig, self._rig_text = rig, rig_text
         self._store, self._joiner, self._settings, self._clock = store, joiner, settings, clock
@@ -94,7 +96,7 @@ class SessionManager:
         self._lifecycle = SessionLifecycle(store, rig, clock, settings.control_tolerance_mm, clock_state)
         self._table, self._observations = self._lifecycle.table, ObservationTable(store)
         self._jobs = JobTable(store, rig.name)
-        self._aim = aim
+        self._aim, self._why_no_fix = aim, why_no_fix
         self.turn = threading.RLock()
         self._shot: Shot | None = None
         self._pending = PendingWrites(store)
@@ -228,7 +230,7 @@ class SessionManager:
                     self._aim(name)
                 shot.aimed = self._clock.now()
                 self._shot = shot
-                shot.wait(self._clock, self._settings.shot_timeout_s)
+                shot.wait(self._clock, self._settings.shot_timeout_s, self._why_no_fix)
                 result = self._keep_shot(session, name, shot, most_off_mm)
             finally:
                 self._shot = None

@@ -11,6 +11,7 @@ import pytest
 from calibration.observations import parse_observations
 from daemon.acquisition.joiner import ObservationJoiner, joint_inputs, signal_inputs
 from daemon.acquisition.status.present import expected_of
+from daemon.acquisition.status.snapshot import AcquisitionStatus
 from daemon.cli.lines.state import show_session
 from daemon.commands import CommandError
 from daemon.config.config import Config
@@ -409,6 +410,9 @@ def test_a_control_point_that_is_not_there_is_told(rig: Rig) -> None:
     start(rig)
     rig.keeper._settings = SessionsSection(fixes_per_shot=10_000, shot_timeout_s=1.0)
     with pytest.raises(CommandError, match="of 10000 good fixes within 1 s; check with"):
+        rig.shoot("cp1", (9000.0, 500.0, 2000.0))
+    rig.keeper._why_no_fix = AcquisitionStatus(error="the disk is full").why_no_fix
+    with pytest.raises(CommandError, match="good fixes within 1 s; nothing can be stored: the disk is full"):
         rig.shoot("cp1", (9000.0, 500.0, 2000.0))
     with pytest.raises(CommandError, match="'r' is a prism of the rig"):
         rig.say("shoot", point="r")
