@@ -279,7 +279,8 @@ class SessionManager:
         if session is None:
             return None
         suspicions = [as_dict(suspicion) for suspicion in self._prisms.suspicions(session)]
-        return self._table.summary(session.id, self._observations.tally) | {"prism_suspicions": suspicions}
+        shown = {"prism_suspicions": suspicions, "jumped": [j for j in self._rig.joint_names if j in session.jumped]}
+        return self._table.summary(session.id, self._observations.tally) | shown
 
     def aim_again(self) -> None:
         """Aim the station again if it may be on another prism and a program can aim it."""

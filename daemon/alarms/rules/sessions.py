@@ -118,8 +118,8 @@ def model_not_loaded(evidence: Evidence) -> Iterator[Finding]:
 
 @rule(
     "critical",
-    "Check the joint's zero. Then run `rigcal model zeros-checked` (before the first model: `rigcal session accept`), "
-    "or calibrate again.",
+    "If a session is open, stop it: no fix since the jump is used. Check the joint's zero. Then run `rigcal model "
+    "zeros-checked` (before the first model: `rigcal session accept`), or calibrate again with new sessions.",
     hold_s=10.0,
 )
 def zero_lost(evidence: Evidence) -> Iterator[Finding]:

@@ -71,6 +71,7 @@ def test_a_session_in_which_an_encoder_jumps_is_not_calibrated_with_the_one_that
     session_rig.live(2)
     jump(session_rig)
     session_rig.live(1)
+    assert session_rig.keeper.open_session()["jumped"] == ["theta1"]  # type: ignore[index]
     session_rig.shoot("cp1", (9000.0, 500.0, 2000.0))
     ended = session_rig.say("stop")
     assert ended["not_used"] == LOST
