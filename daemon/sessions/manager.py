@@ -35,7 +35,7 @@ from daemon.sessions.observing import ObservationMaker, PendingWrites
 from daemon.sessions.open_session import CONTROL_POINT_RADIUS_MM, OpenSession
 from daemon.sessions.prism_watch import PrismWatch, as_dict
 from daemon.sessions.prisms.guard import MotionLimit, Suspicion
-from daemon.sessions.station_setups import AXES, StationSetups
+from daemon.sessions.station_setups import StationSetups
 from daemon.sessions.without_job import why_no_job
 from daemon.store.errors import is_unwritable
 from daemon.store.queries.jobs import JobTable
@@ -142,6 +142,9 @@ class SessionManager:
     def _watch_prism(self, fix: Fix) -> None:
         for session in self._taking():
             if session.lasted(fix.stamp):
+                if session.is_outdated:
+                    self._prisms.judge_again(session, fix.stamp)
+                    self._observing.restore(session)
                 self._prisms.see(session, fix)
 
     def _taking(self) -> list[OpenSession]:
@@ -314,7 +317,7 @@ class SessionManager:
         session = self._open
         if session is not None:
             session.shots += [Shot(0, since, until) for since, until in times]
-            self._prisms.restore(session)
+            self._prisms.judge_again(session)
 
     def look_back(self, operator: str) -> None:
         """Use the fixes of the open session again, after an operator has confirmed that the station is on its prism."""
@@ -352,7 +355,7 @@ class SessionManager:
         session_id = identifier(arguments, "id", "a session's id", default=self._table.free_id(prism))
         if session_id in self._table.ids():
             raise CommandError(f"session {session_id!r} exists already; choose another --id")
-        points = self._setups.control_points(setup_id)
+        points = self._setups.control_points(setup_id, session_id)
         session = OpenSession(session_id, setup_id, prism, kind, self._store.order, now, control_points=points)
         self._prisms.begin(session)
         if not is_aimed:
@@ -375,7 +378,7 @@ class SessionManager:
         self._open = session
 
     def _keep_shot(self, session: OpenSession, name: str, shot: Shot, most_off_mm: float) -> dict[str, Any]:
-        """Store a shot before it ends, and exclude earlier fixes near its point if this shot is the first to locate it.
+        """Store a shot before it ends, and judge earlier fixes near its point again if this shot has located it.
 
         Fixes of the point that arrive later are recognised by its place.
         """
@@ -384,9 +387,13 @@ class SessionManager:
             result = self._setups.store_shot(
                 session.setup_id, session.id, name, phase, shot.fixes, shot.places_mm, most_off_mm=most_off_mm
             )
-            if result["misclosure_mm"] is None:  # the place was unknown before
-                self._observations.exclude_near(session.id, [result[axis] for axis in AXES], CONTROL_POINT_RADIUS_MM)
-            points = self._setups.control_points(session.setup_id)
+            points = self._setups.control_points(session.setup_id, session.id)
+            for place in session.control_points:
+                if place not in points:  # an earlier shot of this point was not of the point
+                    self._observations.include_near(session.id, name, place, CONTROL_POINT_RADIUS_MM)
+            if result["misclosure_mm"] is None:
+                for place in points:
+                    self._observations.exclude_near(session.id, place, CONTROL_POINT_RADIUS_MM)
             constants_mm = first_constants_mm(self._store, session.id)
             self._store.once_committed(partial(session.know, points, constants_mm))
         return result
@@ -425,7 +432,8 @@ class SessionManager:
         self._open, self._ended = self._lifecycle.unfinished(self._rig_text, stations)
         self._lifecycle.judge_readings()
         for session in self._taking():
-            session.know(self._setups.control_points(session.setup_id), first_constants_mm(self._store, session.id))
+            points = self._setups.control_points(session.setup_id, session.id)
+            session.know(points, first_constants_mm(self._store, session.id))
             session.jumped = self._lifecycle.jumped(session)
             self._prisms.restore(session)
             self._observing.restore(session)

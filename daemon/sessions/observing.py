@@ -123,16 +123,23 @@ class ObservationMaker:
         self.newest: tuple[str, Stamp, str | None] | None = None
 
     def restore(self, session: OpenSession) -> None:
-        """Restore the newest observation, and the places of the standstill in which an earlier run ended."""
+        """Restore the newest observation, and decide again on the places of the newest standstill, from the store."""
         with self._store.reader() as reader:
             newest = newest_observation(reader, session.id)
-            if newest is not None:
-                self.newest = session.id, reader.stamp(newest), newest["excluded"]
-            for row in last_standstills(reader, session.id, ELSEWHERE, SETTLED_FIXES):
-                standstill, stamp = Standstill.of_pose(session.id, row["pose"]), reader.stamp(row)
-                place_mm, values = (row["x_mm"], row["y_mm"], row["z_mm"]), json.loads(row["values_json"])
-                confirmed = session.confirmations_by(stamp)
-                self._places.add(standstill, stamp.monotonic_ns, place_mm, values, confirmed)
+            if newest is None:
+                return
+            self.newest = session.id, reader.stamp(newest), newest["excluded"]
+            rows = [(row, reader.stamp(row)) for row in last_standstills(reader, session.id, ELSEWHERE, SETTLED_FIXES)]
+        self._places, decided = StandstillPlaces(self._rig), Exclusions()
+        for row, stamp in rows:
+            standstill, confirmed = Standstill.of_pose(session.id, row["pose"]), session.confirmations_by(stamp)
+            place_mm, values = (row["x_mm"], row["y_mm"], row["z_mm"]), json.loads(row["values_json"])
+            decided |= self._places.add(standstill, stamp.monotonic_ns, place_mm, values, confirmed)
+        if rows:
+            last, newest_at = rows[-1]
+            stored = {at.monotonic_ns: row["excluded"] for row, at in rows if row["pose"] == last["pose"]}
+            changed = {at_ns: decided[at_ns] for at_ns, excluded in stored.items() if decided[at_ns] != excluded}
+            self._exclude(session, changed, newest_at)
 
     def observe(self, session: OpenSession, joined: JoinedFix, place_mm: Place) -> None:
         """Make an observation of the session in which a fix was measured.

@@ -104,7 +104,7 @@ def _write(reader: Reader, config: Config, found: Mapping[str, Any], out: Path, 
         prism_turned_utc_ns=tuple(at_ns for turning, at_ns in words if turning),
         control_points={
             point["name"]: (point["x_mm"], point["y_mm"], point["z_mm"])
-            for point in control_points(reader, found["setup_id"])
+            for point in control_points(reader, found["setup_id"], session_id)
         },
         doubtful=doubtful,
         can_channels=numbers,

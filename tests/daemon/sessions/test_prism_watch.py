@@ -131,6 +131,52 @@ def test_a_control_point_is_shot_in_a_session_without_a_suspicion(rig: Rig) -> N
     assert set(used(rig)) == {8000}
 
 
+def test_a_station_on_a_control_point_at_the_start_of_a_set_up_s_first_session_comes_to_the_prism_unsuspected(
+    rig: Rig,
+) -> None:
+    """Where a restart would use the fixes, so does the daemon that goes on."""
+    rig.target_mm = CONTROL_MM
+    start(rig)
+    rig.live(3)
+    rig.shoot("cp1", CONTROL_MM)
+    rig.target_mm = PRISM_MM
+    rig.live(3)
+    assert rig.keeper.prism_suspicions() == []
+    assert events(rig, EventKind.PRISM_JUMP) == []
+    assert set(used(rig)) == {8000}
+    assert len(used(rig)) > 40
+    rig.target_mm = ANOTHER_MM
+    rig.live(1)
+    assert len(rig.keeper.prism_suspicions()) == 1, "and the prism is watched from then on"
+
+
+def test_fixes_of_a_control_point_before_its_first_shot_do_not_outnumber_those_of_the_prism(rig: Rig) -> None:
+    near_mm = (PRISM_MM[0], PRISM_MM[1] + 330.0, PRISM_MM[2])  # too near to be a jump
+    start(rig)
+    rig.live(2)
+    rig.target_mm = near_mm
+    rig.live(4)
+    assert set(used(rig)) == {8330}
+    rig.shoot("cp1", near_mm)
+    rig.target_mm = PRISM_MM
+    rig.live(0.5)
+    assert set(used(rig)) == {8000}
+    assert not [why for why in reasons(rig) if why.startswith(ELSEWHERE)]
+
+
+def test_a_suspicion_of_fixes_on_a_control_point_is_not_revived_by_a_restart(rig: Rig) -> None:
+    start(rig)
+    rig.live(2)
+    rig.target_mm = CONTROL_MM  # by hand, before the command
+    rig.live(1)
+    rig.shoot("cp1", CONTROL_MM)
+    rig.keeper = rig.new_keeper()
+    assert rig.keeper.prism_suspicions() == []
+    rig.target_mm = PRISM_MM
+    rig.live(1)
+    assert rig.keeper.prism_suspicions() == []
+
+
 def test_a_station_that_comes_back_from_a_control_point_to_another_prism_is_suspected(rig: Rig) -> None:
     start(rig)
     rig.live(2)
