@@ -96,14 +96,14 @@ def raise_if_cancelled() -> None:
 
 
 @contextlib.contextmanager
-def acting_for(caller: Caller | None, is_cancelled: Callable[[], bool] | None = None) -> Iterator[None]:
+def acting_for(caller: Caller | None, is_cancelled: Callable[[], bool] = lambda: False) -> Iterator[None]:
     """Set the current caller of this thread.
 
     Args:
         caller: the caller; None for nobody.
-        is_cancelled: returns True once the work is not wanted any more; None to keep the present one.
+        is_cancelled: returns True once the caller has disconnected.
     """
-    token, left_token = _current.set(caller), _is_cancelled.set(is_cancelled or _is_cancelled.get())
+    token, left_token = _current.set(caller), _is_cancelled.set(is_cancelled)
     try:
         yield
     finally:

@@ -106,15 +106,12 @@ def _in_session(session: Mapping[str, Any]) -> NextStep:
 
 def _of_session(session: Mapping[str, Any]) -> tuple[str, str]:
     """Return what to do in an open session, and the command for it."""
+    if (hindrance := _hindrance(session)) is not None:
+        return hindrance
     points = {
         phase: {s["point"] for s in session["control_shots"] if s["phase"] == phase} for phase in ("start", "end")
     }
     enough = _ENOUGH_POSES.get(session["kind"], _ENOUGH_USUALLY)
-    if suspicions := session.get("prism_suspicions"):
-        return str(suspicions[0]["remedy"]), ""
-    if session["setup_moved"]:
-        how = "`rigcal session stop`, then `rigcal setup new`"
-        return "the station has moved: stop the session, then record the station's new set-up", how
     if not points["start"] and not points["end"]:
         return "aim the station at a control point and shoot it", "`rigcal session shoot NAME`"
     if session["poses"] < enough:
@@ -124,6 +121,19 @@ def _of_session(session: Mapping[str, Any]) -> tuple[str, str]:
         return "enough poses: shoot the control points again", f"`rigcal session shoot {missing[0]}`"
     step = "enough poses: stop the session; identification, effects, residual and report then run automatically"
     return step, "`rigcal session stop`"
+
+
+def _hindrance(session: Mapping[str, Any]) -> tuple[str, str] | None:
+    """Return what to do before more fixes of an open session are of use, and the command for it; None for nothing."""
+    if jumped := session.get("jumped"):
+        why = f"{jumped[0]} has jumped, so no later fix is used"
+        return f"{why}: stop the session, check the joint's zero, then start a new session", "`rigcal session stop`"
+    if suspicions := session.get("prism_suspicions"):
+        return str(suspicions[0]["remedy"]), ""
+    if session["setup_moved"]:
+        how = "`rigcal session stop`, then `rigcal setup new`"
+        return "the station has moved: stop the session, then record the station's new set-up", how
+    return None
 
 
 def _of_jobs(jobs: Sequence[Mapping[str, Any]], awaited_session: str | None) -> NextStep:

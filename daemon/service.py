@@ -103,10 +103,11 @@ class Daemon:
             config.sessions,
             parts.clock,
             run_id=store.run_id or parts.clock.now().utc_ns // NS_PER_S,  # unique even if the table of runs is damaged
-            aim=parts.aim,
             limits=motion_limits(config),
+            aim=parts.aim,
             are_jobs_enabled=config.jobs.enabled,
             clock_state=lambda: None if self._time is None else self._time.state,
+            why_no_fix=lambda: self._acquisition.status().why_no_fix(),
         )
         models = ModelTable(store, parts.rig.name, parts.clock)
         self._live_model = LiveModel(models, parts.rig)

@@ -44,7 +44,7 @@ class Evidence:
         metrics_fault: why the metrics cannot be read; None where they can, or are not configured.
         notice_faults: target to which notices cannot be delivered at present -> why.
         untrained_sessions: closed session that no training uses -> why; without sessions that newer ones replace.
-        zeros_lost: joints whose encoder has jumped since the newest closed session was started or accepted, and whose
+        zeros_lost: joints whose encoder has jumped since the newest session was started or accepted, and whose
             zero has not been checked.
         ended_threads: thread of the daemon that an error has ended -> the error.
         meter_fault: why the open guide gets no answer from its gain meter, a clause; None if it does.

@@ -76,7 +76,6 @@ def replay_logs(
             settings.sessions,
             clock,
             run_id=0,
-            aim=None,
             limits=motion_limits(settings),
         )
         commands = Commands()

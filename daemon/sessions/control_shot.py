@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import math
 import threading
+from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass, field
 
@@ -54,7 +55,7 @@ class Shot:
         if len(self.fixes) == self.wanted:
             self.done.set_result(None)
 
-    def wait(self, clock: Clock, timeout_s: float) -> None:
+    def wait(self, clock: Clock, timeout_s: float, why_no_fix: Callable[[], str | None]) -> None:
         """Wait until the shot is complete.
 
         If the caller disconnects, the shot is cancelled, because an operator who cancels turns the station back to the
@@ -63,6 +64,7 @@ class Shot:
         Args:
             clock: clock of the rig, on which the timeout runs.
             timeout_s: longest wait.
+            why_no_fix: returns why no fix can arrive at present, a clause; None if fixes can arrive.
 
         Raises:
             CommandError: the caller has disconnected, or too few good fixes were measured.
@@ -77,8 +79,8 @@ class Shot:
                 log.info("a shot of a control point was cancelled: its caller has disconnected")
                 raise CommandError("the shot was cancelled, and nothing was stored", FAILED)
         if not is_complete:
+            advice = "check with `rigcal status` that the station is aimed at the control point and locked"
             raise CommandError(
-                f"only {len(self.fixes)} of {self.wanted} good fixes within {timeout_s:g} s; check with "
-                "`rigcal status` that the station is aimed at the control point and locked",
+                f"only {len(self.fixes)} of {self.wanted} good fixes within {timeout_s:g} s; {why_no_fix() or advice}",
                 FAILED,
             )

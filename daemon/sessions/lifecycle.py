@@ -13,7 +13,7 @@ Each change is one transaction.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from functools import partial
 from typing import Any
 
@@ -25,7 +25,7 @@ from daemon.rig_files import misreading
 from daemon.sessions.open_session import CONSTANT_TOLERANCE_MM, OpenSession
 from daemon.store.connection import rig_sha256
 from daemon.store.queries.jobs import JobTable
-from daemon.store.queries.observations import first_constants_mm
+from daemon.store.queries.observations import first_constants_mm, stations_of
 from daemon.store.queries.poses import has_poses_before_enclosed, is_enclosed
 from daemon.store.queries.sessions import (
     OPEN_AT_NEXT,
@@ -77,16 +77,18 @@ class SessionLifecycle:
         self.table, self._setups = SessionTable(store, rig.name), SetupTable(store, rig.name)
         self._jobs = JobTable(store, rig.name)
 
-    def unfinished(self, rig_text: str) -> tuple[OpenSession | None, list[OpenSession]]:
+    def unfinished(self, rig_text: str, stations: Collection[str]) -> tuple[OpenSession | None, list[OpenSession]]:
         """Return the rig's open session, and ended sessions whose last captures are not yet decoded.
 
-        A session belongs to one rig file. A session started with a different file, of this rig or of another one, is
-        closed, and gets no more fixes. So is a session that another one followed: earlier versions left sessions of
-        other rigs open. A session stored with the bare file, from before the store kept the decoding of channels,
-        continues.
+        A session belongs to one rig file and to the stations that measured in it. A session started with a different
+        file, of this rig or of another one, is closed, and gets no more fixes. So is a session with fixes of a station
+        that is not configured any more, because what is known of that station's target does not apply to another
+        station. So is a session that another one followed: earlier versions left sessions of other rigs open. A session
+        stored with the bare file, from before the store kept the decoding of channels, continues.
 
         Args:
             rig_text: the present rig file with the decoding of channels.
+            stations: names of the configured stations.
         """
         opened: OpenSession | None = None
         ended: list[OpenSession] = []
@@ -94,10 +96,10 @@ class SessionLifecycle:
         own = {rig_sha256(text) for text in (rig_text, bare, bare.removesuffix("\n"))}
         for row in self.table.unfinished():
             is_own = row["rig"] == self._rig.name and row["rig_sha256"] in own
-            next_one = self.table.follower(row["id"]) if row["state"] == "open" else None
-            if not is_own or next_one is not None:
-                if row["state"] == "open":
-                    self._close_of_another_file(row, next_one)
+            changed = self._what_changed(row, stations, is_own=is_own) if row["state"] == "open" else None
+            if changed is not None:
+                self._close_left_open(row, *changed)
+            if changed is not None or not is_own:
                 continue
             since, until = self._store.stamp(row, "started_"), self._store.stamp_or_none(row, "ended_")
             order = self._store.order
@@ -108,17 +110,27 @@ class SessionLifecycle:
                 ended.append(found)
         return opened, ended
 
-    def _close_of_another_file(self, row: Mapping[str, Any], next_one: str | None) -> None:
-        """Close a session left open by an earlier run, as of the end of the last run that measured in it.
+    def _what_changed(
+        self, row: Mapping[str, Any], stations: Collection[str], *, is_own: bool
+    ) -> tuple[str, str | None] | None:
+        """Return why a session left open by an earlier run must be closed, a clause; None if it continues.
 
-        Args:
-            row: the session.
-            next_one: session that was started while this one was open: the station may have been on its prism.
+        Returns:
+            The clause, and the session that was started while this one was open, if there is one: the station may have
+            been on its prism.
         """
+        next_one = self.table.follower(row["id"])
         if row["rig"] != self._rig.name:
-            changed = f"the rig was changed from {row['rig']} to {self._rig.name}"
-        else:
-            changed = f"session {next_one} was started" if next_one else "the rig file was changed"
+            return f"the rig was changed from {row['rig']} to {self._rig.name}", next_one
+        if next_one is not None:
+            return f"session {next_one} was started", next_one
+        if not is_own:
+            return "the rig file was changed", None
+        gone = [station for station in stations_of(self._store, row["id"]) if station not in stations]
+        return (f"station {gone[0]} was removed from the configuration or renamed", None) if gone else None
+
+    def _close_left_open(self, row: Mapping[str, Any], changed: str, next_one: str | None) -> None:
+        """Close a session left open by an earlier run, as of the end of the last run that measured in it."""
         why = f"closed by rigcal: {changed} while it was open"
         left_open = f"{OPEN_AT_NEXT}{next_one} was started" if next_one else None
         with self._store.transaction():

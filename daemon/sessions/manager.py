@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 import math
 import sqlite3
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -35,7 +35,7 @@ from daemon.sessions.observing import ObservationMaker, PendingWrites
 from daemon.sessions.open_session import CONTROL_POINT_RADIUS_MM, OpenSession
 from daemon.sessions.prism_watch import PrismWatch, as_dict
 from daemon.sessions.prisms.guard import MotionLimit, Suspicion
-from daemon.sessions.station_setups import AXES, StationSetups
+from daemon.sessions.station_setups import StationSetups
 from daemon.sessions.without_job import why_no_job
 from daemon.store.errors import is_unwritable
 from daemon.store.queries.jobs import JobTable
@@ -62,14 +62,14 @@ class SessionManager:
         settings: tolerances and timeouts.
         clock: clock of the rig.
         run_id: number of this run of the daemon; poses are numbered within a run.
+        limits: station -> limits of its prism's motion, for each configured station.
         aim: turns the station to a prism or control point, on a simulated rig; None where the operator does it.
-        limits: station -> limits of its prism's motion.
         are_jobs_enabled: closed sessions start jobs.
         clock_state: returns the state of the computer's clock, noted with a session; None for a different clock.
+        why_no_fix: returns why no fix can arrive at present, a clause; None if fixes can arrive.
 
     Attributes:
-        turn: held while a command is carried out. A caller that runs several commands in one transaction enters it
-            before the transaction.
+        turn: held while a command is carried out, and entered before a transaction of several commands.
     """
 
     def __init__(
@@ -83,10 +83,11 @@ class SessionManager:
         clock: Clock,
         *,
         run_id: int,
+        limits: Mapping[str, MotionLimit],
         aim: Callable[[str], None] | None = None,
-        limits: Mapping[str, MotionLimit] | None = None,
         are_jobs_enabled: bool = True,
         clock_state: Callable[[], ClockState | None] = lambda: None,
+        why_no_fix: Callable[[], str | None] = lambda: None,
     ) -> None:
         self._rig, self._rig_text = rig, rig_text
         self._store, self._joiner, self._settings, self._clock = store, joiner, settings, clock
@@ -94,18 +95,18 @@ class SessionManager:
         self._lifecycle = SessionLifecycle(store, rig, clock, settings.control_tolerance_mm, clock_state)
         self._table, self._observations = self._lifecycle.table, ObservationTable(store)
         self._jobs = JobTable(store, rig.name)
-        self._aim = aim
+        self._aim, self._why_no_fix = aim, why_no_fix
         self.turn = CommandTurn()
         self._shot: Shot | None = None
         self._pending = PendingWrites(store)
-        self._prisms = PrismWatch(store, rig, clock, limits or {}, self._pending.add_event)
+        self._prisms = PrismWatch(store, rig, clock, limits, self._pending.add_event)
         self._observing = ObservationMaker(rig, store, self._observations, self._pending, self._prisms, run_id)
         self._advice = SessionAdvice(rig, setups, self._table, self._prisms)
         self._late: set[str] = set()  # sessions that got fixes after their end, and must be judged again
         # Fixes measured in ended sessions may still arrive, or wait for their joints
         self._open: OpenSession | None = None
         self._ended: list[OpenSession] = []
-        store.unless_damaged(self._go_on, None)
+        store.unless_damaged(partial(self._go_on, limits), None)
 
     # ---- the writer thread -------------------------------------------------------------------------------------------
 
@@ -140,6 +141,9 @@ class SessionManager:
     def _watch_prism(self, fix: Fix) -> None:
         for session in self._taking():
             if session.lasted(fix.stamp):
+                if session.is_outdated:
+                    self._prisms.judge_again(session, fix.stamp)
+                    self._observing.restore(session)
                 self._prisms.see(session, fix)
 
     def _taking(self) -> list[OpenSession]:
@@ -236,7 +240,7 @@ class SessionManager:
                     self._aim(name)
                 shot.aimed = self._clock.now()
                 self._shot = shot
-                shot.wait(self._clock, self._settings.shot_timeout_s)
+                shot.wait(self._clock, self._settings.shot_timeout_s, self._why_no_fix)
                 result = self._keep_shot(session, name, shot, most_off_mm)
             finally:
                 self._shot = None
@@ -285,7 +289,8 @@ class SessionManager:
         if session is None:
             return None
         suspicions = [as_dict(suspicion) for suspicion in self._prisms.suspicions(session)]
-        return self._table.summary(session.id, self._observations.tally) | {"prism_suspicions": suspicions}
+        shown = {"prism_suspicions": suspicions, "jumped": [j for j in self._rig.joint_names if j in session.jumped]}
+        return self._table.summary(session.id, self._observations.tally) | shown
 
     def aim_again(self) -> None:
         """Aim the station again if it may be on another prism and a program can aim it."""
@@ -321,7 +326,7 @@ class SessionManager:
             away = [Shot(0, since, until) for since, until in times(session.id)]
             if away:
                 session.shots += away
-                self._prisms.restore(session)
+                self._prisms.judge_again(session)
 
     def look_back(self, operator: str) -> None:
         """Use the fixes of the open session again, after an operator has confirmed that the station is on its prism."""
@@ -359,7 +364,7 @@ class SessionManager:
         session_id = identifier(arguments, "id", "a session's id", default=self._table.free_id(prism))
         if session_id in self._table.ids():
             raise CommandError(f"session {session_id!r} exists already; choose another --id")
-        points = self._setups.control_points(setup_id)
+        points = self._setups.control_points(setup_id, session_id)
         session = OpenSession(session_id, setup_id, prism, kind, self._store.order, now, control_points=points)
         self._prisms.begin(session)
         if not is_aimed:
@@ -382,20 +387,20 @@ class SessionManager:
         self._open = session
 
     def _keep_shot(self, session: OpenSession, name: str, shot: Shot, most_off_mm: float) -> dict[str, Any]:
-        """Store a shot before it ends, and exclude earlier fixes near its point if this shot is the first to locate it.
-
-        Fixes of the point that arrive later are recognised by its place.
-        """
+        """Store a shot before it ends, and judge earlier fixes near its point again if this shot has located it."""
         with self._store.transaction():
             phase = self._table.phase(session.id, name)
             result = self._setups.store_shot(
                 session.setup_id, session.id, name, phase, shot.fixes, shot.places_mm, most_off_mm=most_off_mm
             )
-            if result["misclosure_mm"] is None:  # the place was unknown before
-                self._observations.exclude_near(session.id, [result[axis] for axis in AXES], CONTROL_POINT_RADIUS_MM)
-            points = self._setups.control_points(session.setup_id)
-            constants_mm = first_constants_mm(self._store, session.id)
-            self._store.once_committed(partial(session.know, points, constants_mm))
+            points = self._setups.control_points(session.setup_id, session.id)
+            for place in session.control_points:
+                if place not in points:  # an earlier shot of this point was not of the point
+                    self._observations.include_near(session.id, name, place, CONTROL_POINT_RADIUS_MM)
+            if result["misclosure_mm"] is None:
+                for place in points:
+                    self._observations.exclude_near(session.id, place, CONTROL_POINT_RADIUS_MM)
+            self._store.once_committed(partial(session.know, points, first_constants_mm(self._store, session.id)))
         return result
 
     def _note_turned(self, session: OpenSession, at: Stamp) -> None:
@@ -427,17 +432,17 @@ class SessionManager:
             raise CommandError("no session is open; start one with `rigcal session start`")
         return self._open
 
-    def _go_on(self) -> None:
+    def _go_on(self, stations: Collection[str]) -> None:
         """Resume the sessions of an earlier run: the open one, and ended ones whose captures were not all decoded."""
-        self._open, self._ended = self._lifecycle.unfinished(self._rig_text)
+        self._open, self._ended = self._lifecycle.unfinished(self._rig_text, stations)
         self._lifecycle.judge_readings()
         for session in self._taking():
-            session.know(self._setups.control_points(session.setup_id), first_constants_mm(self._store, session.id))
+            points = self._setups.control_points(session.setup_id, session.id)
+            session.know(points, first_constants_mm(self._store, session.id))
             session.jumped = self._lifecycle.jumped(session)
             self._prisms.restore(session)
             self._observing.restore(session)
-        opened = self._open
-        if opened is None:
+        if (opened := self._open) is None:
             return
         log.warning("session %s (prism %s) was open when rigcal last ended; it continues", opened.id, opened.prism)
         if self._aim is not None:  # the aiming program may have lost its state; an operator's station has kept its lock

@@ -123,22 +123,30 @@ class ObservationMaker:
         self._table = table
         self._places = StandstillPlaces(rig)
         self._motion_thresholds = {f"{joint.name}_{joint.unit}": joint.motion_threshold for joint in joint_inputs(rig)}
-        self._restored: tuple[Standstill, Mapping[str, float]] | None = None  # until the first standstill of this run
+        self._restored: tuple[Standstill, Mapping[str, float]] | None = None  # newest standstill, and its joints
+        self._has_stood = False  # in this run
         self._resumed: dict[Standstill, Standstill] = {}  # the first standstill of this run -> the one that goes on
         self.newest: tuple[str, Stamp, str | None] | None = None
 
     def restore(self, session: OpenSession) -> None:
-        """Restore the newest observation, and the places of the standstill in which an earlier run ended."""
+        """Restore the newest observation, and decide again on the places of the newest standstill, from the store."""
         with self._store.reader() as reader:
             newest = newest_observation(reader, session.id)
-            if newest is not None:
-                self.newest = session.id, reader.stamp(newest), newest["excluded"]
-            for row in last_standstills(reader, session.id, ELSEWHERE, SETTLED_FIXES):
-                standstill, stamp = Standstill.of_pose(session.id, row["pose"]), reader.stamp(row)
-                place_mm, values = (row["x_mm"], row["y_mm"], row["z_mm"]), json.loads(row["values_json"])
-                confirmed = session.confirmations_by(stamp)
-                self._places.add(standstill, stamp.monotonic_ns, place_mm, values, confirmed)
-                self._restored = standstill, values
+            if newest is None:
+                return
+            self.newest = session.id, reader.stamp(newest), newest["excluded"]
+            rows = [(row, reader.stamp(row)) for row in last_standstills(reader, session.id, ELSEWHERE, SETTLED_FIXES)]
+        self._places, decided = StandstillPlaces(self._rig), Exclusions()
+        for row, stamp in rows:
+            standstill, confirmed = Standstill.of_pose(session.id, row["pose"]), session.confirmations_by(stamp)
+            place_mm, values = (row["x_mm"], row["y_mm"], row["z_mm"]), json.loads(row["values_json"])
+            decided |= self._places.add(standstill, stamp.monotonic_ns, place_mm, values, confirmed)
+            self._restored = standstill, values
+        if rows:
+            last, newest_at = rows[-1]
+            stored = {at.monotonic_ns: row["excluded"] for row, at in rows if row["pose"] == last["pose"]}
+            changed = {at_ns: decided[at_ns] for at_ns, excluded in stored.items() if decided[at_ns] != excluded}
+            self._exclude(session, changed, newest_at)
 
     def observe(self, session: OpenSession, joined: JoinedFix, place_mm: Place) -> None:
         """Make an observation of the session in which a fix was measured.
@@ -197,11 +205,12 @@ class ObservationMaker:
         if joined.standstill is None:
             return None
         own = Standstill(session.id, self._run_id, joined.standstill)
-        if self._restored is not None and not joined.refused:
-            before, values = self._restored
-            self._restored = None
-            if before.session == own.session and not self._has_moved(values, joined.values):
-                self._resumed[own] = before
+        if not self._has_stood and not joined.refused:
+            self._has_stood = True
+            if self._restored is not None:
+                before, values = self._restored
+                if before.session == own.session and not self._has_moved(values, joined.values):
+                    self._resumed[own] = before
         return self._resumed.get(own, own)
 
     def _has_moved(self, before: Mapping[str, float], now: Mapping[str, float]) -> bool:

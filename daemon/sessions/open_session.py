@@ -29,6 +29,7 @@ class OpenSession:
         jumped: joint whose encoder jumped during the session -> instant of the jump.
         constants_mm: station -> prism constant of its first usable fix.
         control_points: places of the control points of its set-up, mm.
+        is_outdated: a control point was located since its fixes were judged, so they must be judged again.
         confirmations: confirmations that its stations are on its prism.
         guards: station -> guard of its prism; for the writer thread only.
         evidence: evidence from the joints on its prism; for the writer thread only.
@@ -45,6 +46,7 @@ class OpenSession:
     jumped: dict[str, Stamp] = field(default_factory=dict)
     constants_mm: dict[str, float] = field(default_factory=dict)
     control_points: list[Place] = field(default_factory=list)
+    is_outdated: bool = False
     confirmations: list[OperatorConfirmation] = field(default_factory=list)
     guards: dict[str, PrismGuard] = field(default_factory=dict)
     evidence: PrismEvidence | None = None
@@ -65,7 +67,9 @@ class OpenSession:
 
     def know(self, control_points: list[Place], constants_mm: dict[str, float]) -> None:
         """Set the places of the set-up's control points, and the prism constants of earlier fixes."""
+        is_outdated = control_points != self.control_points
         self.control_points, self.constants_mm = control_points, constants_mm
+        self.is_outdated |= is_outdated  # only now, as another thread judges the fixes by these places
 
     def end_shots(self, at: Stamp) -> None:
         """End all open shots at an instant, from which the station is on the session's prism."""

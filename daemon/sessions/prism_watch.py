@@ -20,7 +20,7 @@ from daemon.store.queries.observations import fixes_since_used
 from daemon.store.queries.sessions import SessionTable, prism_confirmations
 from daemon.store.queries.zeros import preset_jumps
 from daemon.store.store import Store
-from drivers.clock import Clock, Stamp
+from drivers.clock import Clock, Stamp, lies_within
 from drivers.readings import DeviceEvent, EventKind, Fix, LockState, Status
 from drivers.stations.survey import position_mm
 
@@ -216,40 +216,60 @@ class PrismWatch:
         self._store.once_committed(partial(session.confirmations.append, OperatorConfirmation(at, is_turning=True)))
 
     def restore(self, session: OpenSession) -> None:
-        """Restore the state of an earlier run of the daemon from the store; the next fix is treated as a new lock.
+        """Restore the state of an earlier run of the daemon from the store.
 
-        A restart ends no suspicion, and a change of target while the daemon was down may begin one. What was restored
-        before is discarded, as after more has become known of the session.
+        A restart ends no suspicion, and a change of target while the daemon was down may begin one.
         """
-        session.guards.clear()
-        session.confirmations.clear()
         self.prepare()
-        self.begin(session)
         with self._store.reader() as reader:
             rows = prism_confirmations(reader, session.id)
             session.confirmations += [OperatorConfirmation(reader.stamp(row), bool(row["turning"])) for row in rows]
+        self.judge_again(session)
+
+    def judge_again(self, session: OpenSession, until: Stamp | None = None) -> None:
+        """Judge the stored fixes of a session anew; the next fix is treated as a new lock.
+
+        Args:
+            session: the session, of which more has become known.
+            until: fixes from this instant on are left out, because they are still to be given to `see`.
+        """
+        session.is_outdated = False
+        session.guards.clear()
+        self.begin(session)
+        with self._store.reader() as reader:
             for station in self._limits:
+                guard = self._guard(session, station)
                 for row in fixes_since_used(reader, session.id, station):
                     fix = _fix(station, row, reader.stamp(row))
-                    self._take(session, fix)
-                    self._guard(session, station).suspect_again(fix.stamp, row["excluded"] or "")
-                self._guard(session, station).look_away()
+                    if until is not None and lies_within(session.order, fix.stamp, until, None):
+                        break
+                    if _is_of_target(session, fix):
+                        guard.see(fix)
+                        guard.suspect_again(fix.stamp, row["excluded"] or "")
+                    else:
+                        guard.look_away()
+                guard.look_away()
         for suspicion in self.suspicions(session):
             log.warning("session %s: %s; %s", session.id, suspicion.reason, suspicion.remedy)
 
     def _take(self, session: OpenSession, fix: Fix) -> DeviceEvent | None:
         guard = self._guard(session, fix.station)
-        place_mm = position_mm(fix)
-        if not session.has(fix.stamp) or (place_mm is not None and session.is_control_point(place_mm)):
-            guard.look_away()
-            return None
-        return guard.see(fix)
+        if _is_of_target(session, fix):
+            return guard.see(fix)
+        guard.look_away()
+        return None
 
     def _guard(self, session: OpenSession, station: str) -> PrismGuard:
         if station not in session.guards:
             limit = self._limits.get(station, MotionLimit())
             session.guards[station] = PrismGuard(station, limit, session.confirmations, self._store.order)
         return session.guards[station]
+
+
+def _is_of_target(session: OpenSession, fix: Fix) -> bool:
+    """Return False for a fix that is known to be of a control point."""
+    place_mm = position_mm(fix)
+    return session.has(fix.stamp) and not (place_mm is not None and session.is_control_point(place_mm))
 
 
 def _followed(session: OpenSession, joined: JoinedFix) -> tuple[PrismGuard, PrismEvidence, Turn] | None:

@@ -218,9 +218,9 @@ class StationSetups:
         """Return the names of a set-up's control points."""
         return [point["name"] for point in control_points(self._store, setup_id)]
 
-    def control_points(self, setup_id: str) -> list[Place]:
-        """Return the places of a set-up's control points, mm in the station's frame."""
-        return [(p["x_mm"], p["y_mm"], p["z_mm"]) for p in control_points(self._store, setup_id)]
+    def control_points(self, setup_id: str, session_id: str) -> list[Place]:
+        """Return the places of the control points that a session in a set-up knows, mm in the station's frame."""
+        return [(p["x_mm"], p["y_mm"], p["z_mm"]) for p in control_points(self._store, setup_id, session_id)]
 
 
 def _place(name: object, place: object) -> dict[str, float]:

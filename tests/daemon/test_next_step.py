@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from daemon.next_step import next_for_page
+from daemon.next_step import next_for_page, next_line
 
 CANDIDATE = {"id": 5, "is_acceptable": True, "refused_because": None, "comparison": {}}
 LIVE = {"id": 4}
@@ -93,6 +93,13 @@ def test_a_critical_alarm_colours_whatever_is_going_on() -> None:
     alarms = {"active": [{"severity": "critical"}]}
     assert next_for_page(status(alarms=alarms))["tone"] == "critical"
     assert next_for_page(status(alarms={"active": [{"severity": "warning"}]}))["tone"] == "warning"
+
+
+def test_a_session_in_which_an_encoder_jumped_is_not_to_be_continued() -> None:
+    now = status(session={**SESSION, "jumped": ["theta1"]})
+    step = "has jumped, so no later fix is used: stop the session, check the joint's zero, then start a new session"
+    assert next_for_page(now)["step"] == f"Theta1 {step}."
+    assert next_line(now) == f"theta1 {step}: `rigcal session stop`"
 
 
 def test_a_step_of_a_session_is_a_sentence_with_what_is_left_to_do() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from daemon.acquisition.status.decode_failures import DecodeStatus
-from daemon.acquisition.status.present import Kind
+from daemon.acquisition.status.present import Kind, is_present
 
 
 @dataclass(frozen=True)
@@ -233,3 +233,15 @@ class AcquisitionStatus:
     undecoded_s: float | None = 0.0
     is_behind: bool = False
     is_write_hung: bool = False
+
+    def why_no_fix(self) -> str | None:
+        """Return why no fix of any station can arrive at present, a clause; None if fixes can arrive."""
+        if self.error is not None:
+            return f"nothing can be stored: {self.error}"
+        if self.is_write_hung:
+            return "a write to the store does not end"
+        if self.is_behind:
+            return "earlier captures are still being decoded"
+        if any(is_present(station.status) for station in self.stations):
+            return None
+        return "; ".join(f"{station.name}: {station.sentence}" for station in self.stations) or "there is no station"

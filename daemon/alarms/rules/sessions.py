@@ -118,16 +118,17 @@ def model_not_loaded(evidence: Evidence) -> Iterator[Finding]:
 
 @rule(
     "critical",
-    "Check the joint's zero. Then run `rigcal model zeros-checked` (before the first model: `rigcal session accept`), "
-    "or calibrate again.",
+    "If a session was open at the jump, stop it: no fix since the jump is used. Check the joint's zero. Where it is as "
+    "before, run `rigcal model zeros-checked`; otherwise, and before the first model, start a new session and "
+    "calibrate again.",
     hold_s=10.0,
 )
 def zero_lost(evidence: Evidence) -> Iterator[Finding]:
     """The encoder of a joint has jumped, and nobody has checked its zero.
 
-    It has jumped since the live model was trained, since the newest session was started, or in the open session. The
-    model then gives no tip, no job uses sessions from before the jump, and the open session takes no more fixes.
-    Cleared 10 s after none of these conditions holds.
+    It has jumped since the live model was trained, since the newest session was started, or in the open session.
+    Aborted and rejected sessions do not count. The model then gives no tip, no job uses sessions from before the jump,
+    and the open session takes no more fixes. Cleared 10 s after none of these conditions holds.
     """
     model = () if evidence.model is None else evidence.model.jumped
     session = () if evidence.session is None else evidence.session.jumped

@@ -114,7 +114,7 @@ def _write(
         away_utc_ns=tuple((steady.of(left).utc_ns, steady.of(back or ended).utc_ns) for left, back in away),
         control_points={
             point["name"]: (point["x_mm"], point["y_mm"], point["z_mm"])
-            for point in control_points(reader, found["setup_id"])
+            for point in control_points(reader, found["setup_id"], session_id)
         },
         doubtful=doubtful,
         can_channels=numbers,

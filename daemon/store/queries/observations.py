@@ -22,6 +22,13 @@ _EXCLUDE = f"""UPDATE observations SET excluded = coalesce(?, CASE WHEN moving T
     AND excluded IS NOT '{OF_CONTROL_POINT}'"""
 _EXCLUDE_NEAR = f"""UPDATE observations SET excluded = '{OF_CONTROL_POINT}' WHERE session_id = ?1 AND excluded IS NULL
     AND (x_mm - ?2) * (x_mm - ?2) + (y_mm - ?3) * (y_mm - ?3) + (z_mm - ?4) * (z_mm - ?4) < ?5 * ?5"""
+# Undoes _EXCLUDE_NEAR for a place that was not the point's. It changed only observations from before the point's first
+# shot in the session: a shot after which observations were used is not one that locates the point.
+_INCLUDE_NEAR = f"""UPDATE observations SET excluded = NULL
+    WHERE session_id = ?1 AND excluded = '{OF_CONTROL_POINT}'
+    AND (x_mm - ?2) * (x_mm - ?2) + (y_mm - ?3) * (y_mm - ?3) + (z_mm - ?4) * (z_mm - ?4) < ?5 * ?5
+    AND (boot_id, monotonic_ns) < (SELECT boot_id, monotonic_ns FROM control_shots
+        WHERE session_id = ?1 AND name = ?6 ORDER BY id LIMIT 1)"""
 _OBSERVATIONS = """SELECT session_id, setup_id, prism, pose, utc_ns, monotonic_ns, boot_id, x_mm, y_mm, z_mm,
         sigma_x_mm, sigma_y_mm, sigma_z_mm, dwell_s, values_json
     FROM observations WHERE excluded IS NULL AND session_id IN ({}) ORDER BY id"""
@@ -39,7 +46,8 @@ _FIXES = f"""SELECT fixes.*, seen.excluded FROM calibration_sessions AS session 
             ORDER BY o.boot_id DESC, o.monotonic_ns DESC LIMIT 1), 0)
     ORDER BY fixes.id"""
 # Observations of the last standstill of each run of the daemon; poses are called `run.standstill`.
-_LAST_STANDSTILLS = """SELECT pose, utc_ns, monotonic_ns, boot_id, x_mm, y_mm, z_mm, values_json FROM observations
+_LAST_STANDSTILLS = """SELECT pose, utc_ns, monotonic_ns, boot_id, x_mm, y_mm, z_mm, values_json, excluded
+    FROM observations
     WHERE session_id = ?1 AND (excluded IS NULL OR excluded LIKE ?2) AND pose IN (
         SELECT pose FROM (SELECT pose, max(id) FROM observations WHERE session_id = ?1 AND pose IS NOT NULL
             GROUP BY substr(pose, 1, instr(pose, '.'))))
@@ -184,6 +192,12 @@ class ObservationTable:
             db.conn.execute(_EXCLUDE_NEAR, (session_id, *point_mm, radius_mm))
             self._store.once_committed(self._has_excluded)
 
+    def include_near(self, session_id: str, point: str, place_mm: Sequence[float], radius_mm: float) -> None:
+        """Undo `exclude_near` for a place that was wrongly taken for that of a control point."""
+        with self._store.transaction() as db:
+            db.conn.execute(_INCLUDE_NEAR, (session_id, *place_mm, radius_mm, point))
+            self._store.once_committed(self._has_excluded)
+
 
 # ---- for the writing connection and for readers ----------------------------------------------------------------------
 
@@ -258,6 +272,6 @@ def last_standstills(source: RowSource, session_id: str, excluded: str, most: in
         most: largest number of observations.
 
     Returns:
-        pose, utc_ns, monotonic_ns, boot_id, x_mm, y_mm, z_mm and values_json of each.
+        pose, utc_ns, monotonic_ns, boot_id, x_mm, y_mm, z_mm, values_json and excluded of each.
     """
     return iter(source.rows(_LAST_STANDSTILLS, (session_id, f"{excluded}%", most)))

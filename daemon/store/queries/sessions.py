@@ -248,10 +248,14 @@ class SessionTable:
         return next((self._store.stamp(row, "started_") for row in rows if row["id"] in session_ids), None)
 
     def zeros_lost(self) -> list[str]:
-        """Return devices with an unchecked encoder jump since the newest closed session was started or accepted."""
+        """Return devices with an unchecked encoder jump since the newest session was started or accepted.
+
+        Aborted and rejected sessions do not count.
+        """
         sql = """SELECT started_utc_ns, started_monotonic_ns, started_boot_id,
                 accepted_utc_ns, accepted_monotonic_ns, accepted_boot_id
-            FROM calibration_sessions WHERE rig = ? AND state = 'closed' ORDER BY rowid DESC LIMIT 1"""
+            FROM calibration_sessions WHERE rig = ? AND state IN ('open', 'closed') AND rejected_utc_ns IS NULL
+            ORDER BY rowid DESC LIMIT 1"""
         rows = self._store.rows(sql, (self._rig,))
         return [*lost_zeros(self._store, self._rig, self.zeros_known(rows[0]))] if rows else []
 

@@ -29,7 +29,16 @@ _CURRENT = """WITH named AS (
 # The newest shot of each control point of a set-up: with max(), SQLite takes the other columns from its row.
 _NEWEST_SHOTS = """SELECT max(id) AS id, setup_id AS setup, name AS point, session_id AS session, phase, utc_ns,
         misclosure_mm FROM control_shots WHERE setup_id = ? GROUP BY name ORDER BY name"""
-_POINTS = "SELECT name, x_mm, y_mm, z_mm FROM control_points WHERE setup_id = ? ORDER BY rowid"
+# An aborted session is unusable, and so are the places that it alone gave to control points.
+_POINTS = """SELECT name, x_mm, y_mm, z_mm FROM control_points AS p WHERE setup_id = ?1 AND (
+        NOT EXISTS (SELECT 1 FROM control_shots AS s
+            WHERE s.setup_id = ?1 AND s.name = p.name AND s.misclosure_mm IS NULL)
+        OR EXISTS (SELECT 1 FROM control_shots AS s JOIN calibration_sessions AS c ON c.id = s.session_id
+            WHERE s.setup_id = ?1 AND s.name = p.name AND (c.state != 'aborted' OR c.id = ?2)))
+    ORDER BY p.rowid"""
+_POINT_SHOTS = """SELECT s.session_id, s.phase, s.misclosure_mm FROM control_shots AS s
+    JOIN calibration_sessions AS c ON c.id = s.session_id
+    WHERE s.setup_id = ? AND s.name = ? AND c.state != 'aborted'"""
 
 
 @dataclass(frozen=True)
@@ -82,9 +91,8 @@ class SetupTable:
         return SetupRow(**found[0]) if found else None
 
     def point_shots(self, setup_id: str, name: str) -> list[dict[str, Any]]:
-        """Return session, phase and misclosure_mm of a control point's shots."""
-        sql = "SELECT session_id, phase, misclosure_mm FROM control_shots WHERE setup_id = ? AND name = ?"
-        return self._store.rows(sql, (setup_id, name))
+        """Return session, phase and misclosure_mm of a control point's shots in sessions that were not aborted."""
+        return self._store.rows(_POINT_SHOTS, (setup_id, name))
 
     def current_shots(self) -> list[dict[str, Any]]:
         """Return the newest shot of each control point of the current set-up."""
@@ -114,9 +122,17 @@ class SetupTable:
 # ---- for the writing connection and for readers ----------------------------------------------------------------------
 
 
-def control_points(source: RowSource, setup_id: str) -> list[dict[str, Any]]:
-    """Return name, x_mm, y_mm and z_mm of a set-up's control points, in the order of definition."""
-    return list(source.rows(_POINTS, (setup_id,)))
+def control_points(source: RowSource, setup_id: str, session_id: str = "") -> list[dict[str, Any]]:
+    """Return name, x_mm, y_mm and z_mm of a set-up's control points, in the order of definition.
+
+    Points that were located only in sessions that were aborted are left out.
+
+    Args:
+        source: the store.
+        setup_id: the set-up.
+        session_id: points that were located in this session are included, even if it was aborted.
+    """
+    return list(source.rows(_POINTS, (setup_id, session_id)))
 
 
 def setups_of(source: RowSource, session_ids: Sequence[str]) -> list[dict[str, Any]]:

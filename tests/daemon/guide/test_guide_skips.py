@@ -87,7 +87,7 @@ def test_a_control_point_that_is_skipped_just_before_its_shot_is_not_shot(
     looking.start()
     while looking.is_alive():
         rig.live(STEP_S)
-    assert rig.setups.control_points("S1") == []
+    assert rig.setups.control_point_names("S1") == []
     assert rig.known()["step"]["title"] == "Aim at prism r"
 
 

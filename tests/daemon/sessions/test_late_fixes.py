@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from daemon.sessions.lifecycle import NOT_ENCLOSED
 from drivers.clock import NS_PER_S, Stamp
 from drivers.readings import CanCapture, DeviceEvent, EventKind, Reading, Record
-from tests.daemon.sessions.test_prism_watch import ANOTHER_MM, PRISM_MM, WatchedRig, used
+from tests.daemon.sessions.test_prism_watch import ANOTHER_MM, PRISM_MM, used
 from tests.daemon.sessions.test_sessions import start
 from tests.daemon.support.sessions import SOURCE, STEP_S, Rig, closed_afterwards
 from tests.daemon.support.store import table
@@ -15,7 +15,7 @@ from tests.daemon.support.store import table
 CONTROL_MM = (9000.0, 500.0, 2000.0)
 
 
-rig = closed_afterwards(WatchedRig)
+rig = closed_afterwards(Rig)
 
 
 def captured(rig: Rig, seconds: float) -> list[list[Record]]:

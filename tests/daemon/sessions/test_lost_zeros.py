@@ -54,6 +54,26 @@ def test_sessions_before_and_after_a_jump_are_not_calibrated_together(session_ri
     assert sessions.zeros_lost() == []
 
 
+def test_a_session_that_is_started_after_a_jump_ends_the_alarm_of_it_and_one_that_was_aborted_does_not_count(
+    session_rig: Rig,
+) -> None:
+    sessions = SessionTable(session_rig.store, SOURCE.rig.name)
+    session_rig.say("start", prism="r")
+    jump(session_rig)
+    assert sessions.zeros_lost() == ["theta1"]
+    session_rig.say("abort")
+    assert sessions.zeros_lost() == []
+    before = controlled(session_rig)
+    jump(session_rig)
+    assert sessions.zeros_lost() == ["theta1"]
+    session_rig.say("start", prism="s")
+    assert sessions.zeros_lost() == []
+    session_rig.say("abort")
+    assert sessions.zeros_lost() == ["theta1"], "of the session before"
+    session_rig.say("reject", id=before)
+    assert sessions.zeros_lost() == []
+
+
 def test_an_operator_who_accepts_a_session_is_told_of_every_joint_that_has_jumped_since(session_rig: Rig) -> None:
     before = controlled(session_rig)
     jump(session_rig)
@@ -71,6 +91,7 @@ def test_a_session_in_which_an_encoder_jumps_is_not_calibrated_with_the_one_that
     session_rig.live(2)
     jump(session_rig)
     session_rig.live(1)
+    assert session_rig.keeper.open_session()["jumped"] == ["theta1"]  # type: ignore[index]
     session_rig.shoot("cp1", (9000.0, 500.0, 2000.0))
     ended = session_rig.say("stop")
     assert ended["not_used"] == LOST

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -10,16 +9,12 @@ import pytest
 from click.testing import CliRunner
 
 from calibration.rig.description import shipped_rig
-from daemon.acquisition.joiner import ObservationJoiner, joint_inputs
 from daemon.cli.main import main
 from daemon.commands import CommandError
 from daemon.config.config import parse_config
-from daemon.config.sections import SessionsSection
 from daemon.guide.times_away import times_away
 from daemon.sessions.export.captured_logs import export_session
 from daemon.sessions.export.session_file import SessionFile, read_session_file
-from daemon.sessions.manager import SessionManager
-from daemon.sessions.prisms.guard import MotionLimit
 from daemon.sessions.prisms.standstill_places import ELSEWHERE
 from daemon.store.queries.observations import moving_observations
 from daemon.store.reader import Reader
@@ -31,7 +26,7 @@ from simulators.devices.stations.total_station import StationSettings
 from simulators.faults import parse_faults
 from simulators.rig.truth import RigTruth
 from simulators.rig_simulator import RigSimulator, SimulatorSettings
-from tests.daemon.sessions.test_sessions import SOURCE, Rig, start
+from tests.daemon.sessions.test_sessions import Rig, start
 from tests.daemon.support.sessions import STEP_S, closed_afterwards, disk_fails
 from tests.daemon.support.store import table
 from tests.simulated.captures import Step, generate
@@ -53,26 +48,7 @@ NEARER_MM = (6000.0, 8000.0, 1000.0)  # one fix a second does not show this jump
 CONTROL_MM = (9000.0, 500.0, 2000.0)
 
 
-class WatchedRig(Rig):
-    """A rig whose configuration names its station."""
-
-    def new_keeper(self, aim: Callable[[str], None] | None = None) -> SessionManager:
-        self.runs += 1
-        return SessionManager(
-            SOURCE.rig,
-            SOURCE.text,
-            self.store,
-            self.setups,
-            ObservationJoiner(joint_inputs(SOURCE.rig), settle_s=0.5),
-            SessionsSection(fixes_per_shot=3),
-            self.clock,
-            run_id=self.runs,
-            aim=aim,
-            limits={"station": MotionLimit()},
-        )
-
-
-rig = closed_afterwards(WatchedRig)
+rig = closed_afterwards(Rig)
 
 
 def used(rig: Rig) -> list[float]:
@@ -154,6 +130,52 @@ def test_a_control_point_is_shot_in_a_session_without_a_suspicion(rig: Rig) -> N
     assert rig.keeper.prism_suspicions() == []
     assert events(rig, EventKind.PRISM_JUMP) == []
     assert set(used(rig)) == {8000}
+
+
+def test_a_station_on_a_control_point_at_the_start_of_a_set_up_s_first_session_comes_to_the_prism_unsuspected(
+    rig: Rig,
+) -> None:
+    """Where a restart would use the fixes, so does the daemon that goes on."""
+    rig.target_mm = CONTROL_MM
+    start(rig)
+    rig.live(3)
+    rig.shoot("cp1", CONTROL_MM)
+    rig.target_mm = PRISM_MM
+    rig.live(3)
+    assert rig.keeper.prism_suspicions() == []
+    assert events(rig, EventKind.PRISM_JUMP) == []
+    assert set(used(rig)) == {8000}
+    assert len(used(rig)) > 40
+    rig.target_mm = ANOTHER_MM
+    rig.live(1)
+    assert len(rig.keeper.prism_suspicions()) == 1, "and the prism is watched from then on"
+
+
+def test_fixes_of_a_control_point_before_its_first_shot_do_not_outnumber_those_of_the_prism(rig: Rig) -> None:
+    near_mm = (PRISM_MM[0], PRISM_MM[1] + 330.0, PRISM_MM[2])  # too near to be a jump
+    start(rig)
+    rig.live(2)
+    rig.target_mm = near_mm
+    rig.live(4)
+    assert set(used(rig)) == {8330}
+    rig.shoot("cp1", near_mm)
+    rig.target_mm = PRISM_MM
+    rig.live(0.5)
+    assert set(used(rig)) == {8000}
+    assert not [why for why in reasons(rig) if why.startswith(ELSEWHERE)]
+
+
+def test_a_suspicion_of_fixes_on_a_control_point_is_not_revived_by_a_restart(rig: Rig) -> None:
+    start(rig)
+    rig.live(2)
+    rig.target_mm = CONTROL_MM  # by hand, before the command
+    rig.live(1)
+    rig.shoot("cp1", CONTROL_MM)
+    rig.keeper = rig.new_keeper()
+    assert rig.keeper.prism_suspicions() == []
+    rig.target_mm = PRISM_MM
+    rig.live(1)
+    assert rig.keeper.prism_suspicions() == []
 
 
 def test_a_station_that_comes_back_from_a_control_point_to_another_prism_is_suspected(rig: Rig) -> None:

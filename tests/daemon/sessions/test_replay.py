@@ -16,7 +16,7 @@ from click.testing import CliRunner
 from calibration.rig.description import shipped_rig
 from daemon.acquisition.acquisition import Acquisition
 from daemon.cli.main import main
-from daemon.composition import decoders, joiner
+from daemon.composition import decoders, joiner, motion_limits
 from daemon.config.config import read_config
 from daemon.rig_files import load_rig
 from daemon.service import declare_channels
@@ -136,7 +136,15 @@ def live(
         setups = StationSetups(source.rig, store, clock, config.sessions.control_tolerance_mm)
         setups.new_command({"id": "S1", **setup})
         keeper = SessionManager(
-            source.rig, source.text, store, setups, joiner(config, source.rig), config.sessions, clock, run_id=1
+            source.rig,
+            source.text,
+            store,
+            setups,
+            joiner(config, source.rig),
+            config.sessions,
+            clock,
+            run_id=1,
+            limits=motion_limits(config),
         )
         clock.set(begin.shifted(round(SESSION_S[0] * NS_PER_S)))
         keeper.start_command({"prism": "r", "id": "s1"})

@@ -12,6 +12,7 @@ import pytest
 from calibration.observations import parse_observations
 from daemon.acquisition.joiner import ObservationJoiner, joint_inputs, signal_inputs
 from daemon.acquisition.status.present import expected_of
+from daemon.acquisition.status.snapshot import AcquisitionStatus
 from daemon.cli.lines.state import show_session
 from daemon.commands import CommandError
 from daemon.config.config import Config
@@ -22,6 +23,7 @@ from daemon.rig_files import load_rig
 from daemon.sessions.manager import SessionManager
 from daemon.sessions.session_data import sessions_csv, setup_lines
 from daemon.store.errors import NotInStoreError
+from daemon.store.queries.observations import OF_CONTROL_POINT
 from daemon.store.reader import Reader
 from drivers.clock import NS_PER_S, Stamp
 from drivers.readings import DeviceEvent, EventKind, Record
@@ -350,6 +352,27 @@ def test_an_open_session_survives_the_daemon(rig: Rig) -> None:
     assert rig.say("stop")["id"] == "s001-r"
 
 
+def test_an_open_session_ends_where_its_station_is_not_configured_any_more(rig: Rig) -> None:
+    """What is known of the target of one station does not apply to another, nor to one of another name."""
+    start(rig)
+    rig.live(3)
+    rig.target_mm = (9000.0, 8000.0, 1000.0)
+    rig.live(1)
+    rig.stations = ("station", "topcon")
+    rig.keeper = rig.new_keeper()
+    assert len(rig.keeper.prism_suspicions()) == 1, "another station that is added changes nothing"
+    rig.stations = ("topcon",)
+    rig.keeper = rig.new_keeper()
+    assert rig.keeper.open_session() is None
+    rig.live(2)
+    (closed,) = rig.say("list")
+    assert closed["note"] == (
+        "closed by rigcal: station station was removed from the configuration or renamed while it was open"
+    )
+    rows = rig.store.rows("SELECT x_mm FROM observations WHERE excluded IS NULL")
+    assert {round(row["x_mm"]) for row in rows} == {3000}
+
+
 def test_control_points_that_hold_say_so(rig: Rig) -> None:
     start(rig)
     assert rig.shoot("cp1", (9000.0, 500.0, 2000.0))["misclosure_mm"] is None
@@ -433,6 +456,9 @@ def test_a_control_point_that_is_not_there_is_told(rig: Rig) -> None:
     rig.keeper._settings = SessionsSection(fixes_per_shot=10_000, shot_timeout_s=1.0)
     with pytest.raises(CommandError, match="of 10000 good fixes within 1 s; check with"):
         rig.shoot("cp1", (9000.0, 500.0, 2000.0))
+    rig.keeper._why_no_fix = AcquisitionStatus(error="the disk is full").why_no_fix
+    with pytest.raises(CommandError, match="good fixes within 1 s; nothing can be stored: the disk is full"):
+        rig.shoot("cp1", (9000.0, 500.0, 2000.0))
     with pytest.raises(CommandError, match="'r' is a prism of the rig"):
         rig.say("shoot", point="r")
 
@@ -493,6 +519,57 @@ def test_a_shot_repeated_at_the_start_replaces_the_one_before(rig: Rig) -> None:
     again = rig.shoot("cp1", (9000.0, 620.0, 2000.0))
     assert again["misclosure_mm"] is None
     assert rig.say("setup_list")[0]["control_points"][0]["y_mm"] == pytest.approx(620.0)
+
+
+def test_a_first_shot_that_was_made_on_the_prism_is_undone_by_its_repetition(rig: Rig) -> None:
+    start(rig)
+    rig.live(3)
+    rig.shoot("cp1", rig.target_mm)
+    assert rig.keeper.open_session()["observations"] == 0  # type: ignore[index]
+    assert rig.shoot("cp1", (9000.0, 500.0, 2000.0))["misclosure_mm"] is None
+    rig.live(1)
+    rig.shoot("cp1", (9000.0, 500.0, 2000.0))
+    summary = rig.say("stop")
+    assert summary["observations"] > 60
+    assert set(summary["excluded"]) <= {"moving", OF_CONTROL_POINT}
+    assert summary["not_used"] is None
+
+
+def test_a_repeated_first_shot_gives_back_no_fix_of_another_prism(rig: Rig) -> None:
+    start(rig)
+    rig.live(3)
+    rig.target_mm = (3000.0, 18000.0, 1000.0)
+    rig.live(2)
+    rig.shoot("cp1", rig.target_mm)
+    rig.shoot("cp1", (9000.0, 500.0, 2000.0))
+    rows = rig.store.rows("SELECT y_mm FROM observations WHERE excluded IS NULL")
+    assert {round(row["y_mm"]) for row in rows} == {8000}
+
+
+def test_a_control_point_that_only_an_aborted_session_has_located_is_unknown(rig: Rig) -> None:
+    start(rig)
+    rig.shoot("cp1", rig.target_mm)
+    rig.say("abort")
+    assert rig.say("setup_list")[0]["control_points"] == []
+    rig.say("start", prism="r")
+    rig.live(2)
+    assert rig.keeper.open_session()["observations"] > 20  # type: ignore[index]
+    assert rig.shoot("cp1", (9000.0, 620.0, 2000.0))["misclosure_mm"] is None
+    assert rig.shoot("cp1", (9000.0, 500.0, 2000.0))["misclosure_mm"] is None
+    rig.live(1)
+    end = rig.shoot("cp1", (9000.0, 500.0, 2000.0))
+    assert (end["misclosure_mm"], end["moved"]) == (pytest.approx(0.0, abs=1e-6), False)
+    assert rig.say("stop")["observations"] > 40
+    assert rig.say("setup_list")[0]["state"] == "ok"
+
+
+def test_a_control_point_of_known_place_stays_known_after_an_aborted_session(rig: Rig) -> None:
+    rig.say("setup_new", id="S1", control_points={"cp1": [9000.0, 500.0, 2000.0]})
+    rig.say("start", prism="r")
+    rig.shoot("cp1", (9000.0, 500.0, 2000.0))
+    rig.say("abort")
+    rig.say("start", prism="r")
+    assert rig.shoot("cp1", (9000.0, 503.0, 2000.0))["misclosure_mm"] == pytest.approx(3.0, abs=1e-6)
 
 
 def test_a_control_point_of_known_place_is_held_against_it_from_the_first_shot(rig: Rig) -> None:

@@ -19,6 +19,7 @@ from daemon.config.sections import SessionsSection
 from daemon.host.time_service import ClockState
 from daemon.rig_files import load_rig
 from daemon.sessions.manager import SessionManager
+from daemon.sessions.prisms.guard import MotionLimit
 from daemon.sessions.station_setups import StationSetups
 from daemon.store.store import Store
 from drivers.clock import NS_PER_S, ManualClock
@@ -42,6 +43,7 @@ class Rig:
     """A machine and a station that can be stood still and moved, on a clock that only moves when told to.
 
     Attributes:
+        stations: names of the configured stations; the first one measures.
         steps_of_fix: the station gives a fix in every so many steps.
         machine: what a new keeper takes for the machine.
         runs: how many keepers there have been; each is of a new run of the daemon.
@@ -49,6 +51,7 @@ class Rig:
     """
 
     steps_of_fix = 1
+    stations: Sequence[str] = ("station",)
     machine = SOURCE.rig
     runs = 0
     observing: Callable[[], contextlib.AbstractContextManager[object]] = staticmethod(contextlib.nullcontext)
@@ -77,6 +80,7 @@ class Rig:
             SessionsSection(fixes_per_shot=3),
             self.clock,
             run_id=self.runs,
+            limits={name: MotionLimit() for name in self.stations},
             aim=aim,
             clock_state=lambda: self.clock_state,
         )
@@ -104,7 +108,7 @@ class Rig:
     def fix(self) -> Fix:
         east, north, up = (v / 1000 for v in self.target_mm)
         return Fix(
-            "station",
+            self.stations[0],
             self.clock.now(),
             self.clock.now(),
             Status.OK,

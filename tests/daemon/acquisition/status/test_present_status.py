@@ -152,6 +152,18 @@ def test_a_silent_station_is_not_locked_and_its_last_fix_not_ok(rig: Rig) -> Non
     assert station.sentence == "silent, nothing received for 40 s (last: locked, ok)"
 
 
+def test_why_no_fix_can_arrive_is_known(rig: Rig) -> None:
+    rig.hear(UP, frame(7, 0.0))
+    wait_until(lambda: rig.status().stations[0].fixes == 1)
+    assert rig.status().why_no_fix() is None
+    rig.clock.advance(40.0)
+    assert rig.status().why_no_fix() == "ts1: silent, nothing received for 40 s (last: locked, ok)"
+    assert AcquisitionStatus(error="the disk is full").why_no_fix() == "nothing can be stored: the disk is full"
+    assert AcquisitionStatus(is_write_hung=True).why_no_fix() == "a write to the store does not end"
+    assert AcquisitionStatus(is_behind=True).why_no_fix() == "earlier captures are still being decoded"
+    assert AcquisitionStatus().why_no_fix() == "there is no station"
+
+
 def test_open_gaps_are_in_the_status_until_they_close_and_one_line_for_all_channels_of_a_link(rig: Rig) -> None:
     starts = [Gap(name, GapReason.SILENT, at(0)) for name in ("theta1", "theta3")]
     rig.hear(UP, *starts, Gap("ts1", GapReason.LOCK_LOST, at(0)))

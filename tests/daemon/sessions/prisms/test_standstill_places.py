@@ -94,14 +94,14 @@ def test_each_standstill_has_a_place_of_its_own(session_rig: Rig) -> None:
 def test_restarts_of_the_daemon_within_a_standstill_forget_none_of_its_places(session_rig: Rig) -> None:
     session_rig.say("start", prism="r")
     stand(session_rig, PRISM, 120)
-    stand(session_rig, away(0.5), 30)
+    stand(session_rig, away(0.3), 30)
     for _ in range(2):
         session_rig.keeper = session_rig.new_keeper()
-        stand(session_rig, away(0.5), 30)
+        stand(session_rig, away(0.3), 30)
     assert {y for y, why in observed(session_rig) if why is None} == {8000.0}
     session_rig.keeper = session_rig.new_keeper()
-    stand(session_rig, away(0.5), 120)  # most fixes now: what was stored before the restarts is decided anew
-    assert {y for y, why in observed(session_rig) if why is None} == {8500.0}
+    stand(session_rig, away(0.3), 120)  # most fixes now: what was stored before the restarts is decided anew
+    assert {y for y, why in observed(session_rig) if why is None} == {8300.0}
 
 
 def test_an_operator_s_word_within_a_standstill_outlasts_a_restart(session_rig: Rig) -> None:
@@ -119,7 +119,7 @@ def test_a_boom_that_moved_while_the_daemon_was_down_stands_at_a_new_place(sessi
     stand(session_rig, PRISM, 60)
     session_rig.keeper = session_rig.new_keeper()
     session_rig.values["theta1"] += 5.0
-    stand(session_rig, away(0.5), 40)
+    stand(session_rig, away(0.3), 40)
     assert {why for _, why in observed(session_rig)} == {None}
 
 
