@@ -437,6 +437,12 @@ def m032_rejected_sessions(db: Database) -> None:
     _add_columns(db, "calibration_sessions", "rejected_", "reason TEXT", *decision)
 
 
+@MIGRATIONS()
+def m033_observations_before_a_shot(db: Database) -> None:
+    """The newest observation that was stored before a shot: only these may have been judged without its point."""
+    _add_columns(db, "control_shots", "", "observations_through INTEGER")
+
+
 def unknown_migrations(db: Database) -> list[str]:
     """Return the migrations in `db` that this program does not know; then a newer program made it."""
     empty = Database(memory=True)

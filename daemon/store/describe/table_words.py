@@ -202,6 +202,7 @@ TABLES: dict[str, Words] = {
             **_XYZ,
             "fix_ids_json": "numbers of the fixes",
             "misclosure_mm": "distance from the point's known place, mm; NULL in the shot that defines the place",
+            "observations_through": "number of the newest observation stored before the shot; NULL if unknown",
         },
         {"": "the shot"},
     ),

@@ -22,12 +22,12 @@ _EXCLUDE = f"""UPDATE observations SET excluded = coalesce(?, CASE WHEN moving T
     AND excluded IS NOT '{OF_CONTROL_POINT}'"""
 _EXCLUDE_NEAR = f"""UPDATE observations SET excluded = '{OF_CONTROL_POINT}' WHERE session_id = ?1 AND excluded IS NULL
     AND (x_mm - ?2) * (x_mm - ?2) + (y_mm - ?3) * (y_mm - ?3) + (z_mm - ?4) * (z_mm - ?4) < ?5 * ?5"""
-# Undoes _EXCLUDE_NEAR for a place that was not the point's. It changed only observations from before the point's first
-# shot in the session: a shot after which observations were used is not one that locates the point.
+# Undoes _EXCLUDE_NEAR for a place that was not the point's. It changed only observations that were stored before the
+# point's first shot in the session: a shot after which observations were used is not one that locates the point.
 _INCLUDE_NEAR = f"""UPDATE observations SET excluded = NULL
     WHERE session_id = ?1 AND excluded = '{OF_CONTROL_POINT}'
     AND (x_mm - ?2) * (x_mm - ?2) + (y_mm - ?3) * (y_mm - ?3) + (z_mm - ?4) * (z_mm - ?4) < ?5 * ?5
-    AND (boot_id, monotonic_ns) < (SELECT boot_id, monotonic_ns FROM control_shots
+    AND id <= (SELECT observations_through FROM control_shots
         WHERE session_id = ?1 AND name = ?6 ORDER BY id LIMIT 1)"""
 _OBSERVATIONS = """SELECT session_id, setup_id, prism, pose, utc_ns, monotonic_ns, boot_id, x_mm, y_mm, z_mm,
         sigma_x_mm, sigma_y_mm, sigma_z_mm, dwell_s, values_json

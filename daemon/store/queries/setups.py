@@ -111,7 +111,9 @@ class SetupTable:
 
     def add_shot(self, setup_id: str, name: str, measured: Stamp, **columns: object) -> None:
         """Add a shot of a control point."""
-        row = {"setup_id": setup_id, "name": name, **columns, **self._store.instant(measured)}
+        through = self._store.number("SELECT coalesce(max(id), 0) FROM observations", ())
+        row = {"setup_id": setup_id, "name": name, "observations_through": through, **columns}
+        row |= self._store.instant(measured)
         self._store.insert("control_shots", row)
 
     def mark_moved(self, setup_id: str) -> None:

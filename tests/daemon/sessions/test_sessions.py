@@ -530,7 +530,7 @@ def test_a_first_shot_that_was_made_on_the_prism_is_undone_by_its_repetition(rig
     rig.live(1)
     rig.shoot("cp1", (9000.0, 500.0, 2000.0))
     summary = rig.say("stop")
-    assert summary["observations"] > 60
+    assert summary["observations"] > 50, "but for fixes that waited for their joints during the shot"
     assert set(summary["excluded"]) <= {"moving", OF_CONTROL_POINT}
     assert summary["not_used"] is None
 
@@ -541,6 +541,7 @@ def test_a_repeated_first_shot_gives_back_no_fix_of_another_prism(rig: Rig) -> N
     rig.target_mm = (3000.0, 18000.0, 1000.0)
     rig.live(2)
     rig.shoot("cp1", rig.target_mm)
+    rig.live(1)  # fixes that waited for their joints during the shot
     rig.shoot("cp1", (9000.0, 500.0, 2000.0))
     rows = rig.store.rows("SELECT y_mm FROM observations WHERE excluded IS NULL")
     assert {round(row["y_mm"]) for row in rows} == {8000}
