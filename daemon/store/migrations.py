@@ -431,15 +431,9 @@ def m031_states_of_devices(db: Database) -> None:
 
 @MIGRATIONS()
 def m032_rejected_sessions(db: Database) -> None:
-    """Closed sessions that an operator has rejected; accepted_after_job is set by both decisions on a session."""
-    # The instant is NULL unless the rejection stands.
+    """Closed sessions that an operator has rejected, with an instant while that holds; observations before a shot."""
     decision = ("by TEXT NOT NULL DEFAULT ''", *_instant(optional=True).split(", "), *_CALLER)
     _add_columns(db, "calibration_sessions", "rejected_", "reason TEXT", *decision)
-
-
-@MIGRATIONS()
-def m033_observations_before_a_shot(db: Database) -> None:
-    """The newest observation that was stored before a shot: only these may have been judged without its point."""
     _add_columns(db, "control_shots", "", "observations_through INTEGER")
 
 
