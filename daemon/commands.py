@@ -115,38 +115,32 @@ class CommandTurn:
     """Reentrant lock that is held while a command is carried out: commands wait for their turn.
 
     A command whose caller disconnects while it waits is not carried out: entering raises CommandError, within half a
-    second or as soon as its turn comes. Once it has its turn, it may enter again, whether its caller is connected or
-    not.
+    second or as soon as its turn comes.
     """
 
     def __init__(self) -> None:
         self._lock = threading.RLock()
-        self._depth = 0  # how often the thread that has its turn has entered
 
     def __enter__(self) -> None:
+        if self._lock.acquire(blocking=False):
+            return
         while not self._lock.acquire(timeout=LOOK_S):
             raise_if_cancelled()
         try:
-            if not self._depth:
-                raise_if_cancelled()
+            raise_if_cancelled()
         except CommandError:
             self._lock.release()
             raise
-        self._depth += 1
 
     def __exit__(self, *_: object) -> None:
         self.leave()
 
     def enter_if_free(self) -> bool:
         """Enter without waiting; return False if a command of another thread is being carried out."""
-        if not self._lock.acquire(blocking=False):
-            return False
-        self._depth += 1
-        return True
+        return self._lock.acquire(blocking=False)
 
     def leave(self) -> None:
         """Leave, as the end of a `with` block does."""
-        self._depth -= 1
         self._lock.release()
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import deque
 from dataclasses import replace
 
 from drivers.clock import NS_PER_S, Stamp
@@ -11,7 +10,6 @@ from drivers.stall_detector import LATE_S
 
 _MARGIN_NS = int(LATE_S * NS_PER_S)  # samples may be read this late without being marked as doubtful
 _BACKLOG_NS = 5 * NS_PER_S  # a backlog is read within this time, however long reading was interrupted
-_SHORT_BACKLOG_NS = 2 * NS_PER_S  # the same after an interruption of at most _MARGIN_NS
 
 
 class JumpWatch:
@@ -28,9 +26,6 @@ class JumpWatch:
     as silence, because they show that the port was read. Samples of doubtful time are not good samples but mark a
     backlog, which is read from the first of them on.
 
-    A sample that was read late was preceded by a silence at least as long. So no sample of a steady series can be later
-    than the longest silence of the last seconds, and a step that takes two samples to be plausible is a jump.
-
     Args:
         max_rate_per_s: fastest motion of the joint, in the unit of the positions passed to `jumped_from`.
         slack: largest step that is never a jump.
@@ -45,7 +40,6 @@ class JumpWatch:
         self._good_from_ns = 0  # earliest instant at which `_good` may have been taken
         self._read_ns: int | None = None
         self._from_ns = self._late_until_ns = 0
-        self._silences_ns: deque[tuple[int, int]] = deque()  # (end, length) of those with no longer one after them
 
     def bad(self, stamp: Stamp) -> None:
         """Process a sample without a usable position."""
@@ -58,14 +52,14 @@ class JumpWatch:
         if stamp.is_doubtful:
             return None
         before, before_from_ns = self._good, self._good_from_ns
-        self._good, self._good_from_ns = position, self._from_ns - self._silences_ns[0][1]
+        self._good, self._good_from_ns = position, self._from_ns
         if before is None:
             return None
         moved = position - before
         if self._modulus is not None:
             half = self._modulus / 2
             moved = (moved + half) % self._modulus - half
-        within_ns = max(now_ns - before_from_ns, 0)
+        within_ns = max(now_ns - before_from_ns, 0) + _MARGIN_NS
         return before if abs(moved) > self._rate_per_ns * within_ns + self._slack else None
 
     def _read(self, now_ns: int) -> None:
@@ -73,24 +67,13 @@ class JumpWatch:
         before_ns, self._read_ns = self._read_ns, now_ns
         if before_ns is None:  # no backlog: opening a port discards waiting data
             self._from_ns = self._late_until_ns = now_ns
-            self._silences_ns.append((now_ns, _MARGIN_NS))  # not known
             return
         silence_ns = now_ns - before_ns
-        self._note_silence(now_ns, min(silence_ns, _MARGIN_NS))
         is_late = silence_ns > _MARGIN_NS
         if now_ns >= self._late_until_ns:
             self._from_ns = before_ns if is_late else now_ns
         if is_late:
             self._late_until_ns = max(self._late_until_ns, now_ns + min(silence_ns // 2, _BACKLOG_NS))
-
-    def _note_silence(self, end_ns: int, silence_ns: int) -> None:
-        """Add a silence to those of the last seconds, of which the first is the longest."""
-        silences_ns = self._silences_ns
-        while silences_ns and silences_ns[-1][1] <= silence_ns:
-            silences_ns.pop()
-        silences_ns.append((end_ns, silence_ns))
-        while silences_ns[0][0] < end_ns - _SHORT_BACKLOG_NS:
-            silences_ns.popleft()
 
 
 def joint_watch(max_rate_per_s: float | None, step: float, unit: str) -> JumpWatch | None:

@@ -2,7 +2,6 @@
 
 One thread accepts connections. One thread per client reads its requests and carries them out, so that a slow command
 delays no other client. A client that is idle, leaves a request unfinished or does not read its answers is disconnected.
-When all places are taken, a client that has left gives way at once, although its command may still be carried out.
 """
 
 from __future__ import annotations
@@ -237,30 +236,19 @@ class ControlServer:
             _turn_away(connection, "the daemon's computer cannot start a thread for a client; try again in a moment")
 
     def _make_room(self, now_ns: int) -> bool:
-        """Disconnect the clients that have left, or else the one that has been idle longest.
-
-        Returns False if all others are busy or have just connected.
-        """
-        left = [client for client in self._clients if _is_closed_by_peer(client.connection)]
-        for client in left:
-            self._disconnect(client)
-        if left:
-            return True
+        """Disconnect the client that has been idle longest; return False if all are busy or have just connected."""
         give_way_ns = now_ns - int(self._limits.give_way_s * NS_PER_S)
         idle = [(c.waiting_ns, c) for c in self._clients if c.waiting_ns is not None and c.waiting_ns <= give_way_ns]
         if not idle:
             return False
         _, longest = min(idle, key=lambda pair: pair[0])
-        self._disconnect(longest)
+        self._clients.discard(longest)
+        _hang_up(longest)
         return True
 
-    def _disconnect(self, client: _Client) -> None:
-        self._clients.discard(client)
-        _hang_up(client)
-
     def _serve(self, client: _Client) -> None:
-        with client.connection:  # closed when it is no longer one of the clients, whose descriptors are looked at
-            try:
+        try:
+            with client.connection:
                 caller = _peer_of(client.connection)
                 while (line := self._next_line(client)) is not None:
                     answer = self._answer(line, caller, lambda: _is_closed_by_peer(client.connection))
@@ -268,11 +256,11 @@ class ControlServer:
                     client.connection.sendall(answer)
                     if len(line) > MAX_LINE_BYTES:
                         return
-            except OSError:
-                log.debug("a control connection ended early", exc_info=True)
-            finally:
-                with self._lock:
-                    self._clients.discard(client)
+        except OSError:
+            log.debug("a control connection ended early", exc_info=True)
+        finally:
+            with self._lock:
+                self._clients.discard(client)
 
     def _next_line(self, client: _Client) -> bytes | None:
         """Return the client's next request; None if the client has closed, was disconnected or exceeded a limit."""

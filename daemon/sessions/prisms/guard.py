@@ -100,7 +100,9 @@ class Suspicion:
     @property
     def remedy(self) -> str:
         """Instruction to the operator."""
-        return f"aim {self.station} at the session's prism; if it is already on that prism, confirm it with {CONFIRM}"
+        zeros = "check that no joint's zero has changed, and " if self.evidence else ""
+        if_already = f"if it is already on that prism, {zeros}confirm it with {CONFIRM}"
+        return f"aim {self.station} at the session's prism; {if_already}"
 
 
 @dataclass(frozen=True, slots=True)

@@ -31,12 +31,13 @@ _PENDING = """SELECT job.id, job.kind, job.session_id, job.state, job.attempts,
     WHERE job.state IN ('queued', 'running', 'interrupted') AND session.rig = ? ORDER BY job.id"""
 # Goes back from the newest session to one through which a job of this kind was queued, or that no longer matters. A job
 # that was queued before an operator accepted a session, or rejected a used one, does not work on the sessions that are
-# used now, and no longer covers anything.
+# used now, and no longer covers anything. Training after a drift uses checks as well, so a rejected one counts for it.
 _COVERED = f"""SELECT session.rowid AS number FROM calibration_sessions AS session NOT INDEXED
     WHERE session.rig = ?1 AND session.rowid > ?2
         AND EXISTS (SELECT 1 FROM jobs WHERE jobs.through_session_id = session.id AND jobs.kind = ?3 AND jobs.id >
             (SELECT coalesce(max(accepted_after_job), 0) FROM calibration_sessions
-                WHERE rig = ?1 AND accepted_after_job IS NOT NULL AND (kind = '{CHECK}') = ?4))
+                WHERE rig = ?1 AND accepted_after_job IS NOT NULL
+                    AND ((kind = '{CHECK}') = ?4 OR rejected_utc_ns IS NOT NULL AND NOT ?4)))
     ORDER BY session.rowid DESC LIMIT 1"""
 _NEWEST = """SELECT job.id, job.session_id, job.ended_utc_ns, job.result_json, job.error FROM jobs AS job
     JOIN calibration_sessions AS session ON session.id = job.session_id

@@ -196,23 +196,6 @@ def test_a_command_knows_when_nobody_waits_for_its_answer_any_more(tmp_path: Pat
         assert ended.wait(DEADLINE_S)
 
 
-def test_clients_that_left_during_their_commands_give_up_their_places(tmp_path: Path) -> None:
-    began, release = threading.Semaphore(0), threading.Event()
-
-    def shoot(_arguments: Mapping[str, Any]) -> bool:
-        began.release()
-        return release.wait(DEADLINE_S)
-
-    with serving(tmp_path / "s", {"shoot": shoot, "echo": echo}, clients=3):
-        with contextlib.ExitStack() as stack:
-            for _ in range(3):
-                stack.enter_context(connected(tmp_path / "s", b'{"command": "shoot"}\n'))
-                assert began.acquire(timeout=DEADLINE_S)
-            assert not answers(tmp_path / "s")
-        assert answers(tmp_path / "s")
-        release.set()
-
-
 def test_a_client_that_has_no_more_to_say_still_waits_for_its_answer(tmp_path: Path) -> None:
     with (
         serving(tmp_path / "s", {"shoot": lambda _: is_cancelled()}),

@@ -14,6 +14,7 @@ from daemon.jobs.order import Order
 from daemon.jobs.process import perform
 from daemon.models.drift import drift_status, gap_status, note_drift
 from daemon.models.model_files import read_model
+from daemon.sessions.lifecycle import SessionLifecycle
 from daemon.store.queries.jobs import JobTable
 from daemon.store.queries.models import ModelTable
 from simulators.effects.library import parse_effects
@@ -114,6 +115,24 @@ def test_a_rejected_check_shows_no_drift(rig: JobRig) -> None:
     assert drift(rig)["drifted_with"] == "c2"
     rig.store.update("calibration_sessions", {"id": "c2"}, {"excluded": "it was rejected", "rejected_utc_ns": 1})
     assert drift(rig) == before
+
+
+def test_a_proposal_that_was_trained_on_a_check_is_made_again_without_it_once_it_is_rejected(
+    rig: JobRig,
+) -> None:
+    with_live_model(rig)
+    rig.plan(drift=f"scores {CLIP} {CLIP}")
+    check(rig, "c1", jobs=7)
+    check(rig, "c2", jobs=14)
+    SessionLifecycle(rig.store, SOURCE.rig, rig.clock, 10.0, lambda: None).reject("c2", "Ada", "measured on w")
+
+    def trained() -> list[list[str]]:
+        return [order["session_ids"] for order in rig.orders() if order["kind"] == "gap"]
+
+    rig.clock.advance(3600.0)
+    rig.wait(lambda: len(trained()) > 2, "training without the check")
+    assert trained()[1] == ["a", "c1", "c2"]
+    assert "c2" not in trained()[2]
 
 
 def test_the_sums_begin_anew_with_each_model_that_goes_live(rig: JobRig) -> None:

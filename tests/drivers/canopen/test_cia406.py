@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+import random
 
 import pytest
 from hypothesis import given
@@ -219,13 +220,20 @@ def test_a_reader_that_is_held_up_for_moments_makes_no_jump(held_up: list[tuple[
         assert not jumps(decoder.decode(at(now), u32(round(number * READ_EVERY * FASTEST) % 65536)))
 
 
-@pytest.mark.parametrize("period_s", [0.01, 0.02, 0.05])
-def test_a_step_of_a_few_periods_of_fastest_motion_in_a_steady_series_is_a_jump(period_s: float) -> None:
-    decoder = encoder(max_rate_per_s=20.0)
+@given(st.integers(0, 1 << 30))
+def test_noise_of_a_joint_that_stands_is_no_jump(seed: int) -> None:
+    decoder, noise = encoder(max_rate_per_s=5.0), random.Random(seed)
     for number in range(300):
-        assert not jumps(decoder.decode(at(number * period_s), u32(5000)))
-    step = round(3 * period_s * FASTEST)
-    assert jumps(decoder.decode(at(300 * period_s), u32(5000 + step)))
+        counts = 30000 + round(noise.gauss(0.0, 10.0))  # 0.055 deg
+        assert not jumps(decoder.decode(at(number * 0.01), u32(counts)))
+
+
+@pytest.mark.parametrize("held_s", [0.025, 0.05, 0.1, 0.2])
+def test_a_device_that_repeats_its_last_value_in_several_frames_makes_no_jump(held_s: float) -> None:
+    decoder = encoder(max_rate_per_s=20.0)
+    for number in range(1000):
+        counts = round(int(number * 0.01 / held_s + 1e-9) * held_s * FASTEST) % 65536
+        assert not jumps(decoder.decode(at(number * 0.01), u32(counts)))
 
 
 def test_a_preset_is_told_again_once_a_backlog_must_be_read() -> None:
