@@ -38,7 +38,7 @@ class Joint(Part):
         sigma: random error of a reading, 1 sigma, deg or mm; enters the observation covariance.
         resolution: quantisation step of the reading, deg or mm.
         linearity: bound of the systematic error, deg, or a fraction of the stroke for `prismatic`; not noise.
-        max_rate: fastest motion, deg/s or mm/s; a change of the reading that needs 0.25 s more than it took is an error.
+        max_rate: fastest motion, deg/s or mm/s; a change of a reading that needs 0.25 s more than it took is an error.
     """
 
     name: str = Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")
