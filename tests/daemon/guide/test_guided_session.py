@@ -259,8 +259,8 @@ def test_a_shot_of_something_else_is_refused_and_a_station_that_moved_ends_the_g
     daemon.say("guide.start", new_setup={"id": "here"}, prisms=["r"], poses=6, check_poses=0)
     shot = GuidedOperator(daemon.say).follow(lambda s: s["step"]["kind"] == "change_prism")
     assert shot["state"] == "open"
-    daemon.say("guide.stop", reason="the test goes on")
     (point,) = next(setup for setup in daemon.say("setup.list") if setup["id"] == "here")["control_points"]
+    daemon.say("guide.stop", reason="the test goes on")
     daemon.say("simulation.aim", target="cp1")
     opened("moved", [point["x_mm"] + 50.0, point["y_mm"], point["z_mm"]])
     daemon.wait("its end", lambda: state(daemon)["state"] != "open")
