@@ -20,13 +20,13 @@ OF_CONTROL_POINT = "a control point, not the prism"  # why an observation must n
 _EXCLUDE = f"""UPDATE observations SET excluded = coalesce(?, CASE WHEN moving THEN ? END)
     WHERE session_id = ? AND boot_id = ? AND monotonic_ns = ?
     AND excluded IS NOT '{OF_CONTROL_POINT}'"""
-_EXCLUDE_NEAR = f"""UPDATE observations SET excluded = '{OF_CONTROL_POINT}' WHERE session_id = ?1 AND excluded IS NULL
+# Session, place and radius in mm
+_NEAR = """session_id = ?1
     AND (x_mm - ?2) * (x_mm - ?2) + (y_mm - ?3) * (y_mm - ?3) + (z_mm - ?4) * (z_mm - ?4) < ?5 * ?5"""
+_EXCLUDE_NEAR = f"UPDATE observations SET excluded = '{OF_CONTROL_POINT}' WHERE excluded IS NULL AND {_NEAR}"
 # Undoes _EXCLUDE_NEAR for a place that was not the point's. It changed only observations that were stored before the
 # point's first shot in the session: a shot after which observations were used is not one that locates the point.
-_INCLUDE_NEAR = f"""UPDATE observations SET excluded = NULL
-    WHERE session_id = ?1 AND excluded = '{OF_CONTROL_POINT}'
-    AND (x_mm - ?2) * (x_mm - ?2) + (y_mm - ?3) * (y_mm - ?3) + (z_mm - ?4) * (z_mm - ?4) < ?5 * ?5
+_INCLUDE_NEAR = f"""UPDATE observations SET excluded = NULL WHERE excluded = '{OF_CONTROL_POINT}' AND {_NEAR}
     AND id <= (SELECT observations_through FROM control_shots
         WHERE session_id = ?1 AND name = ?6 ORDER BY id LIMIT 1)"""
 _OBSERVATIONS = """SELECT session_id, setup_id, prism, pose, utc_ns, monotonic_ns, boot_id, x_mm, y_mm, z_mm,

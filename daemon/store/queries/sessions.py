@@ -252,8 +252,8 @@ class SessionTable:
         sql = """SELECT started_utc_ns, started_monotonic_ns, started_boot_id, accepted_utc_ns, accepted_monotonic_ns,
                 accepted_boot_id FROM calibration_sessions
             WHERE rig = ? AND state IN ('open', 'closed') AND rejected_utc_ns IS NULL ORDER BY rowid DESC LIMIT 1"""
-        known = [self.zeros_known(row) for row in self._store.rows(sql, (self._rig,))]
-        return [*lost_zeros(self._store, self._rig, known[0])] if known else []
+        rows = self._store.rows(sql, (self._rig,))
+        return [*lost_zeros(self._store, self._rig, self.zeros_known(rows[0]))] if rows else []
 
     def zeros_known(self, session: Mapping[str, Any]) -> Stamp:
         """Return when the zeros of a session were last known: at its start, or when an operator accepted it."""
