@@ -185,3 +185,9 @@ def closed_afterwards(make: Callable[[Path], Rig]) -> Any:
         made.store.close()
 
     return rig
+
+
+def start(rig: Rig, **more: Any) -> None:
+    """Describe the set-up S1 and start a session there."""
+    rig.say("setup_new", id="S1", instrument="GTS-905A")
+    rig.say("start", prism="r", operator="Ada", **more)
