@@ -141,8 +141,7 @@ class SessionManager:
     def _watch_prism(self, fix: Fix) -> None:
         for session in self._taking():
             if session.lasted(fix.stamp):
-                if session.is_outdated:
-                    self._prisms.judge_again(session, fix.stamp)
+                if self._prisms.is_judged_again(session, fix.stamp):
                     self._observing.restore(session)
                 self._prisms.see(session, fix)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import sqlite3
 from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
@@ -16,6 +17,7 @@ from daemon.sessions.prisms.evidence import Finding, IdentityLoader, PrismEviden
 from daemon.sessions.prisms.guard import UNTIL, MotionLimit, OperatorConfirmation, PrismGuard, Suspicion, Turn
 from daemon.sessions.prisms.standstill_places import Exclusions
 from daemon.sessions.station_setups import Place
+from daemon.store.errors import StoreError
 from daemon.store.queries.observations import fixes_since_used
 from daemon.store.queries.sessions import SessionTable, prism_confirmations
 from daemon.store.queries.zeros import preset_jumps
@@ -62,13 +64,16 @@ class PrismWatch:
 
     def begin(self, session: OpenSession) -> None:
         """Load what earlier sessions measured in the session's set-up."""
+        session.evidence = self._evidence(session)
+
+    def _evidence(self, session: OpenSession) -> PrismEvidence:
         jumps = [jump for jump in preset_jumps(self._store, None) if jump.device in self._rig.joint_names]
         groups: dict[str, list[tuple[str, Mapping[str, float], Place]]] = {}
         for row in self._table.standstill_observations(session.setup_id, jumps[-1].at if jumps else None):
             place_mm = row["x_mm"], row["y_mm"], row["z_mm"]
             groups.setdefault(row["session_id"], []).append((row["prism"], json.loads(row["values_json"]), place_mm))
         earlier = [sightings_of(self._rig, rows) for rows in groups.values()]
-        session.evidence = PrismEvidence(self._rig, session.prism, self._loader, earlier)
+        return PrismEvidence(self._rig, session.prism, self._loader, earlier)
 
     def see(self, session: OpenSession, fix: Fix) -> None:
         """Add a fix of the session, in order."""
@@ -89,7 +94,11 @@ class PrismWatch:
         _, evidence, turn = followed
         changed: Exclusions = {}
         stretch = evidence.stretch(joined.fix.station, turn.at, turn.is_believed)
-        for finding in evidence.take(stretch, joined, place_mm):
+
+        def is_doubted(known: Stretch) -> bool:
+            return session.guards[known.station].doubt(known.since) is not None
+
+        for finding in evidence.take(stretch, joined, place_mm, is_doubted):
             changed |= self._heed(session, finding)
         changed |= self._stray(session, joined, turn, stretch)
         stretch.instants_ns.append(joined.stamp.monotonic_ns)
@@ -226,19 +235,31 @@ class PrismWatch:
             session.confirmations += [OperatorConfirmation(reader.stamp(row), bool(row["turning"])) for row in rows]
         self.judge_again(session)
 
+    def is_judged_again(self, session: OpenSession, until: Stamp) -> bool:
+        """Do as `judge_again` if a control point was located since; return False if not, or if that must wait.
+
+        A computer that lacks a descriptor or memory keeps the judgement so far; it is tried again at the next fix.
+        """
+        if not session.is_outdated:
+            return False
+        try:
+            self.judge_again(session, until)
+        except (OSError, sqlite3.Error, StoreError, MemoryError) as error:
+            log.warning("session %s: earlier fixes cannot be judged again yet: %s", session.id, error)
+            return False
+        return True
+
     def judge_again(self, session: OpenSession, until: Stamp | None = None) -> None:
         """Judge the stored fixes of a session anew; the next fix is treated as a new lock.
 
         Args:
-            session: the session, of which more has become known.
+            session: the session, of which more has become known; left as it is if the store cannot be read.
             until: fixes from this instant on are left out, because they are still to be given to `see`.
         """
-        session.is_outdated = False
-        session.guards.clear()
-        self.begin(session)
+        evidence, guards = self._evidence(session), dict[str, PrismGuard]()
         with self._store.reader() as reader:
             for station in self._limits:
-                guard = self._guard(session, station)
+                guard = guards[station] = self._new_guard(session, station)
                 for row in fixes_since_used(reader, session.id, station):
                     fix = _fix(station, row, reader.stamp(row))
                     if until is not None and lies_within(session.order, fix.stamp, until, None):
@@ -249,6 +270,7 @@ class PrismWatch:
                     else:
                         guard.look_away()
                 guard.look_away()
+        session.evidence, session.guards, session.is_outdated = evidence, guards, False
         for suspicion in self.suspicions(session):
             log.warning("session %s: %s; %s", session.id, suspicion.reason, suspicion.remedy)
 
@@ -261,9 +283,12 @@ class PrismWatch:
 
     def _guard(self, session: OpenSession, station: str) -> PrismGuard:
         if station not in session.guards:
-            limit = self._limits.get(station, MotionLimit())
-            session.guards[station] = PrismGuard(station, limit, session.confirmations, self._store.order)
+            session.guards[station] = self._new_guard(session, station)
         return session.guards[station]
+
+    def _new_guard(self, session: OpenSession, station: str) -> PrismGuard:
+        limit = self._limits.get(station, MotionLimit())
+        return PrismGuard(station, limit, session.confirmations, self._store.order)
 
 
 def _is_of_target(session: OpenSession, fix: Fix) -> bool:

@@ -12,12 +12,13 @@ import logging
 import math
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 from typing import TYPE_CHECKING
 
 import numpy as np
+import numpy.typing as npt
 
 from calibration.rig.description import Rig
 from daemon.acquisition.joiner import JoinedFix
@@ -40,7 +41,7 @@ MOVED_MM = 100.0  # motion of the boom before another fix of a stretch is used
 MOST_OF_STRETCH = 60  # largest number of fixes used of a stretch
 MOST_OF_GROUP = 10  # largest number of fixes of a group in one comparison
 MOST_STRETCHES = 40  # largest number of stretches kept for comparison
-STRONG = 3  # number of targets that determine where the base stands
+STRONG = 3  # number of targets at different poses that determine where the base stands
 CLEARLY = 2.0  # factor by which a different prism must fit better, or worse
 
 
@@ -81,6 +82,7 @@ class Stretch:
         instants_ns: monotonic instants of its observations whose exclusion depends on the target.
         verdict: verdict so far.
         is_sure: whether there were enough targets to compare with.
+        is_doubted: its fixes are suspected at present, so they are no evidence for others.
     """
 
     station: str
@@ -90,6 +92,7 @@ class Stretch:
     instants_ns: list[int] = field(default_factory=list)
     verdict: Verdict = Verdict.OPEN
     is_sure: bool = False
+    is_doubted: bool = False
 
 
 @dataclass(frozen=True)
@@ -228,8 +231,17 @@ class PrismEvidence:
             self._stretches.remove(gone)
         return made
 
-    def take(self, stretch: Stretch, joined: JoinedFix, place_mm: Place) -> list[Finding]:
-        """Add a fix to a stretch, and return the verdicts that change."""
+    def take(
+        self, stretch: Stretch, joined: JoinedFix, place_mm: Place, is_doubted: Callable[[Stretch], bool]
+    ) -> list[Finding]:
+        """Add a fix to a stretch, and return the verdicts that change.
+
+        Args:
+            stretch: the stretch.
+            joined: the fix with its joints.
+            place_mm: place of its target in the station's frame.
+            is_doubted: returns whether the fixes of a stretch are suspected at present.
+        """
         sighting = self._sighting(joined, place_mm)
         is_new = sighting is not None and self._tells(stretch, sighting)
         if is_new and sighting is not None:
@@ -244,6 +256,8 @@ class PrismEvidence:
             return []
         open_ones = self._stretches if self._waits else [stretch]
         self._waits = False
+        for known in self._stretches:
+            known.is_doubted = is_doubted(known)
         return self._judge(identity, open_ones)
 
     def _sighting(self, joined: JoinedFix, place_mm: Place) -> Sighting | None:
@@ -274,34 +288,52 @@ class PrismEvidence:
             unsure = [s for s in self._stretches if not s.is_sure and not s.is_believed]
             if len(unsure) > 1:
                 news += self._judge_as_one(identity, unsure)
+            if not news:
+                news += self._judge_as_one(identity, self._most(identity, unsure))
             found += news
             if not news:
                 break
             asked = self._stretches
         return list({id(finding.stretch): finding for finding in found}.values())
 
-    def _judge_as_one(self, identity: PrismIdentity, judged: Sequence[Stretch]) -> list[Finding]:
+    def _most(self, identity: PrismIdentity, stretches: Sequence[Stretch]) -> Sequence[Stretch]:
+        """Return the stretches that fit each other as the session's prism; none unless they are most of them."""
+        kept = self._fitting(identity, [_some(stretch.sightings) for stretch in stretches])
+        return [stretches[index] for index in kept] if len(stretches) <= 2 * len(kept) < 2 * len(stretches) else []
+
+    def _judge_as_one(
+        self, identity: PrismIdentity, judged: Sequence[Stretch], beside: Sequence[Stretch] = ()
+    ) -> list[Finding]:
         """Judge one stretch, or several that may be of one target, and return the verdicts that change.
 
         The verdict is sure if either the targets compared with or the stretches' own targets determine where the base
-        stands. Several stretches, each too short by itself, are judged together only if the verdict is sure.
+        stands. Several stretches, each too short by itself, are judged together only if the verdict is sure. A
+        suspicion ends only if both together would determine it.
+
+        Args:
+            identity: the comparison of prisms.
+            judged: the stretches.
+            beside: stretches that are relied on although they are suspected.
         """
         sightings = [one for stretch in judged for one in _some(stretch.sightings)]
         if any(stretch.is_believed for stretch in judged) or not sightings:
             return []
-        relied, own = self._relied_on(identity, judged), targets(self._rig, sightings)
+        relied, own = self._relied_on(identity, judged, beside), targets(self._rig, sightings)
         if len(relied) + len(own) < 2:
             return []
-        misfits, is_sure = identity.misfits(relied, own), len(relied) >= STRONG
-        verdict = self._verdict(misfits, len(relied), len(own))
-        if not is_sure and len(own) > STRONG:
+        others, poses = self._poses(relied), self._poses(own)
+        misfits, is_sure = identity.misfits(relied, own), others >= STRONG
+        verdict = self._verdict(misfits, others, poses)
+        if not is_sure and poses > STRONG:
             alone = identity.misfits(targets(self._rig, []), own)
-            if (by_itself := self._verdict(alone, 0, len(own))) is not Verdict.OPEN:
+            if (by_itself := self._verdict(alone, 0, poses)) is not Verdict.OPEN:
                 misfits, verdict, is_sure = alone, by_itself, True
-        if len(judged) > 1 and not is_sure:
+        is_new_doubt = verdict is Verdict.OTHER or not judged[0].is_doubted
+        suffices = len(judged) == 1 and (is_new_doubt or (others > 0 and others + poses > STRONG))
+        if not is_sure and not suffices:
             return []
         if len(judged) > 1 and verdict is Verdict.NAMED:  # most are of the prism; each must also fit by itself
-            return [finding for stretch in judged for finding in self._judge_as_one(identity, [stretch])]
+            return [finding for stretch in judged for finding in self._judge_as_one(identity, [stretch], judged)]
         # Where nothing fits, the earlier verdict stays
         ends_doubt = len(judged) == 1 and judged[0].verdict is Verdict.OTHER and misfits.prism[self._index()] <= 1.0
         if verdict is Verdict.OPEN and not ends_doubt:
@@ -309,18 +341,31 @@ class PrismEvidence:
         changed = [stretch for stretch in judged if stretch.verdict is not verdict]
         for stretch in judged:
             stretch.verdict, stretch.is_sure = verdict, is_sure and verdict is not Verdict.OPEN
+            stretch.is_doubted &= verdict is not Verdict.NAMED
         distance_m = float(misfits.distance_mm[self._index()]) / 1000
-        return [Finding(stretch, distance_m, self._likeness(misfits, len(own))) for stretch in changed]
+        return [Finding(stretch, distance_m, self._likeness(misfits, poses)) for stretch in changed]
 
     def _verdict(self, misfits: Misfits, relied: int, own: int) -> Verdict:
+        """Return the verdict by targets at so many different poses, relied on and own."""
         named, other = float(misfits.prism[self._index()]), self._best_other(misfits, own)[0]
         if named <= 1.0:
             return Verdict.NAMED if other > max(1.0, CLEARLY * named) else Verdict.OPEN
         fits_another = other <= 1.0 and named > CLEARLY * other
         return Verdict.OTHER if fits_another or relied >= STRONG else Verdict.OPEN
 
+    def _poses(self, seen: Targets) -> int:
+        """Return at how many poses of the boom, `MOVED_MM` of motion apart, there are targets; at most STRONG + 1."""
+        travel_mm = np.array([self._travel_mm[joint.column] for joint in self._rig.joints])
+        different: list[npt.NDArray[np.float64]] = []
+        for joints in seen.readings:
+            if all(np.abs(joints - known) @ travel_mm > MOVED_MM for known in different):
+                different.append(joints)
+            if len(different) > STRONG:
+                break
+        return len(different)
+
     def _best_other(self, misfits: Misfits, own: int) -> tuple[float, str]:
-        """Return the misfit and the name of the best-fitting other target."""
+        """Return the misfit and the name of the best-fitting other target, by own targets at so many poses."""
         named = [
             (float(misfit), f"prism {name}")
             for name, misfit in zip(self._rig.prism_names, misfits.prism, strict=True)
@@ -334,25 +379,37 @@ class PrismEvidence:
         misfit, name = self._best_other(misfits, own)
         return name if misfit <= 1.0 else ""
 
-    def _relied_on(self, identity: PrismIdentity, judged: Sequence[Stretch]) -> Targets:
-        """Return the targets to compare with: groups that fit each other, without those that fit worst."""
+    def _relied_on(self, identity: PrismIdentity, judged: Sequence[Stretch], beside: Sequence[Stretch] = ()) -> Targets:
+        """Return the targets to compare with: groups that fit each other, without those that fit worst.
+
+        Suspected stretches are left out, except those `beside`: each lock on one wrong target would fit the others.
+        """
         groups = [_some(group) for group in self._earlier]
         is_later = False
         for stretch in self._stretches:
             if stretch in judged:
                 is_later = True
             # An operator's confirmation applies from its instant on, never to earlier fixes
-            elif stretch.verdict is not Verdict.OTHER and not (is_later and stretch.is_believed):
+            elif (
+                stretch.verdict is not Verdict.OTHER
+                and not (stretch.is_doubted and stretch not in beside)
+                and not (is_later and stretch.is_believed)
+            ):
                 groups.append(_some(stretch.sightings))
-        groups = [group for group in groups if group]
-        while groups:
-            joined = targets(self._rig, [one for group in groups for one in group])
-            of_groups = np.split(identity.own_misfits(joined), np.cumsum([len(group) for group in groups])[:-1])
-            misfits = [float(np.median(of_group)) for of_group in of_groups]
+        kept = self._fitting(identity, groups)
+        return targets(self._rig, [one for index in kept for one in groups[index]])
+
+    def _fitting(self, identity: PrismIdentity, groups: Sequence[Sequence[Sighting]]) -> list[int]:
+        """Return the indices of the groups that fit each other, without those that fit worst; empty groups are none."""
+        kept = [index for index, group in enumerate(groups) if group]
+        while kept:
+            joined = targets(self._rig, [one for index in kept for one in groups[index]])
+            ends = np.cumsum([len(groups[index]) for index in kept])[:-1]
+            misfits = [float(np.median(of_group)) for of_group in np.split(identity.own_misfits(joined), ends)]
             if max(misfits) <= 1.0:
-                return joined
-            groups.pop(misfits.index(max(misfits)))
-        return targets(self._rig, [])
+                break
+            kept.pop(len(kept) - 1 - misfits[::-1].index(max(misfits)))  # of two that fit alike, the later one
+        return kept
 
     def _index(self) -> int:
         return self._rig.prism_names.index(self._prism)

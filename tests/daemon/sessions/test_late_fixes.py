@@ -8,8 +8,7 @@ from daemon.sessions.lifecycle import NOT_ENCLOSED
 from drivers.clock import NS_PER_S, Stamp
 from drivers.readings import CanCapture, DeviceEvent, EventKind, Reading, Record
 from tests.daemon.sessions.test_prism_watch import ANOTHER_MM, PRISM_MM, used
-from tests.daemon.sessions.test_sessions import start
-from tests.daemon.support.sessions import SOURCE, STEP_S, Rig, closed_afterwards
+from tests.daemon.support.sessions import SOURCE, STEP_S, Rig, closed_afterwards, start
 from tests.daemon.support.store import table
 
 CONTROL_MM = (9000.0, 500.0, 2000.0)

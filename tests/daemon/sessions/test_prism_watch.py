@@ -26,8 +26,7 @@ from simulators.devices.stations.total_station import StationSettings
 from simulators.faults import parse_faults
 from simulators.rig.truth import RigTruth
 from simulators.rig_simulator import RigSimulator, SimulatorSettings
-from tests.daemon.sessions.test_sessions import Rig, start
-from tests.daemon.support.sessions import STEP_S, closed_afterwards, disk_fails
+from tests.daemon.support.sessions import STEP_S, Rig, closed_afterwards, disk_fails, start
 from tests.daemon.support.store import table
 from tests.simulated.captures import Step, generate
 from tests.simulated.scripted_host import ScriptedHost
