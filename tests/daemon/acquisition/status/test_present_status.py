@@ -13,6 +13,8 @@ from daemon.acquisition.acquisition import Acquisition
 from daemon.acquisition.status.decode_failures import KINDS_MAX, FailureCounter
 from daemon.acquisition.status.present import Expected, ExpectedChannel, ExpectedStation, expected_of
 from daemon.acquisition.status.snapshot import AcquisitionStatus
+from daemon.alarms.evidence import Evidence
+from daemon.alarms.library import library
 from daemon.cli.lines.state import decoding_lines, gap_state_lines, station_line
 from daemon.config.config import Config
 from daemon.host.safe_output import duration
@@ -120,6 +122,21 @@ def test_a_device_is_silent_only_once_nothing_of_it_can_wait_for_the_disk(rig: R
     wait_until(lambda: silent() == ["theta1", "theta3", "ts1"])
     rig.hear(frame(8, 40.0))
     assert silent() == ["theta3", "ts1"]
+
+
+def test_devices_that_are_still_starting_when_the_disk_hangs_raise_no_alarm_of_silence(rig: Rig) -> None:
+    def found() -> list[str]:
+        evidence = Evidence(rig.clock.now(), running_s=100.0, acquisition=rig.status())
+        return [alarm.subject for rule in library() for alarm in rule(evidence) if "silent" in alarm.kind]
+
+    rig.hear(UP, frame(7, 0.0))
+    rig.clock.advance(3.0)
+    rig.hear(frame(7, 3.0))  # theta3 starts later
+    assert found() == []
+    with rig.store.transaction():
+        rig.clock.advance(10.0)
+        assert found() == []
+    wait_until(lambda: found() == ["boom", "ts1"])
 
 
 def test_channels_of_an_unplugged_bus_are_not_ok(rig: Rig) -> None:
