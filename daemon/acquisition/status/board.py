@@ -271,6 +271,8 @@ class StatusBoard:
         last, age_s = (None, None) if fix is None else (fix.status.value, _age_s(fix.stamp, now))
         status = present_status(last, age_s, expected.timeout_s, *_open(links.get(name)))
         last_lock, reason = ("", "") if fix is None else (fix.lock.value, fix.reason)
+        is_silent = self._is_silent(last, age_s, expected.timeout_s, links.get(name), now)
+        is_late = status == SILENT and not is_silent
         return StationStatus(
             name=name,
             status=status,
@@ -282,8 +284,8 @@ class StatusBoard:
             last_lock=last_lock,
             good_age_s=None if good is None else _age_s(good.stamp, now),
             tilt_ok=None if fix is None else fix.tilt_ok,
-            sentence=station_sentence(status, age_s, last_lock, last or "", reason),
-            is_silent=self._is_silent(last, age_s, expected.timeout_s, links.get(name), now),
+            sentence=station_sentence(status, age_s, last_lock, last or "", reason, is_late=is_late),
+            is_silent=is_silent,
         )
 
     def _is_silent(
