@@ -66,7 +66,7 @@ class Overview:
         unreadable: dict[str, str] = {}
         clock = self.parts.clock
 
-        setups = SetupTable(self.store, self.parts.rig.name)
+        setups, file = SetupTable(self.store, self.parts.rig.name), self.store.files.database
 
         def stored(part: str, read: Callable[[], T]) -> T | None:
             try:
@@ -97,6 +97,7 @@ class Overview:
             "gap": stored("gap", lambda: gap_status(self.jobs, self.model_table)),
             "events": stored("events", lambda: self.store.newest_events(_EVENTS)) or [],
             "store": str(self.store.path),
+            "store_file": None if file is None else [file.device, file.inode],
             "store_health": self.store_health().as_dict(),
             "unreadable": unreadable,
         }

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from daemon.alarms.evidence import Evidence
 from daemon.host.safe_output import shown
 from daemon.monitoring.notice import Severity
+from drivers.clock import Stamp
 
 # Subject and text of a fault, and its severity where that differs from the rule's usual one.
 Finding = tuple[str, str] | tuple[str, str, Severity]
@@ -51,6 +52,8 @@ class Rule:
         hold_s: how long the fault must be absent before the alarm is cleared.
         needs_decoding: the evidence is that of fresh readings. While captures wait to be stored or decoded, the rule is
             paused: its alarms stay as they are.
+        is_of_decoded: the evidence is that of the newest capture that has been decoded, and `after_s` and `hold_s` are
+            counted by its time. While none is decoded, no time passes for the rule.
         meaning: when the alarm is raised and cleared, for docs/reference/alarms.md.
         find: function that yields the faults in the evidence.
     """
@@ -61,12 +64,17 @@ class Rule:
     after_s: float
     hold_s: float
     needs_decoding: bool
+    is_of_decoded: bool
     meaning: str
     find: Callable[[Evidence], Iterable[Finding]]
 
     def is_paused(self, evidence: Evidence) -> bool:
         """Return True if the evidence is not up to date: it shows neither a fault nor that one is over."""
         return self.needs_decoding and not evidence.is_decoding
+
+    def instant(self, evidence: Evidence) -> Stamp:
+        """Return the instant at which the faults in the evidence were present."""
+        return evidence.decoded if self.is_of_decoded else evidence.now
 
     def __call__(self, evidence: Evidence) -> Iterator[Alarm]:
         """Yield an alarm for every fault in the evidence; none while the rule is paused."""
@@ -87,7 +95,13 @@ def _cut(text: str) -> str:
 
 
 def rule(
-    severity: Severity, remedy: str, *, after_s: float = 0.0, hold_s: float = 0.0, needs_decoding: bool = False
+    severity: Severity,
+    remedy: str,
+    *,
+    after_s: float = 0.0,
+    hold_s: float = 0.0,
+    needs_decoding: bool = False,
+    is_of_decoded: bool = False,
 ) -> Callable[[Callable[[Evidence], Iterable[Finding]]], Rule]:
     """Turn a function into a rule: its name is the kind of alarm, its docstring states when the alarm is raised.
 
@@ -97,10 +111,11 @@ def rule(
         after_s: how long a fault must last before an alarm is raised.
         hold_s: how long the fault must be absent before the alarm is cleared.
         needs_decoding: whether its alarms stay as they are while captures wait to be stored or decoded.
+        is_of_decoded: whether the evidence is that of the newest capture that has been decoded.
     """
 
     def made(find: Callable[[Evidence], Iterable[Finding]]) -> Rule:
         meaning = " ".join((find.__doc__ or "").split())
-        return Rule(find.__name__, severity, remedy, after_s, hold_s, needs_decoding, meaning, find)
+        return Rule(find.__name__, severity, remedy, after_s, hold_s, needs_decoding, is_of_decoded, meaning, find)
 
     return made

@@ -31,6 +31,7 @@ CLEARED_SHOWN = 200
 STOP_S = 5.0
 UNWRITTEN_MAX = 1000  # cleared alarms kept in memory while the store cannot be written
 
+_FIRST = ("not_storing", "store_hangs")  # while they stand, the evidence for other alarms is old
 _LEVELS: Mapping[Severity, int] = {"warning": logging.WARNING, "critical": logging.ERROR}
 
 
@@ -41,7 +42,7 @@ class _Active:
     Attributes:
         alarm: as last returned by its rule.
         raised: when the alarm was raised.
-        seen: when its rule last found the fault.
+        seen: when its rule last found the fault, by the instant of the evidence.
         hold_s: how long the fault must be absent before the alarm is cleared.
         row: its row in the store; None while it is not written.
         written: the alarm as it was last written to the store.
@@ -104,15 +105,17 @@ class AlarmBoard(WokenThread):
             evidence = self._gather()
             found = self._found(replace(evidence, unwatched={**evidence.unwatched, **self._failed_rules}))
             with self._turn:
-                self._raise(found, evidence.now)
-                self._clear(found, evidence.now)
+                self._raise(found, evidence)
+                self._clear(found, evidence)
                 self._looked = evidence.now
             self.wake()
         except Exception as error:  # noqa: BLE001 - logged; alarms must go on
             self._log_once("the alarms could not be evaluated", error)
 
     def status(self) -> dict[str, Any]:
-        """Return the active alarms, critical ones first and then the oldest first, and the age of the last evaluation.
+        """Return the active alarms and the age of the last evaluation.
+
+        Critical alarms come first, those of a store that cannot be written before others, then the oldest first.
 
         Returns:
             `active`: kind, subject, severity, text, remedy, since_utc_ns and age_s of each alarm; `looked_age_s`: real
@@ -121,7 +124,9 @@ class AlarmBoard(WokenThread):
         now = self._clock.now()
         with self._turn:
             active, looked = list(self._active.values()), self._looked
-        active.sort(key=lambda one: (one.alarm.severity != "critical", -now.since(one.raised)))
+        active.sort(
+            key=lambda one: (one.alarm.severity != "critical", one.alarm.kind not in _FIRST, -now.since(one.raised))
+        )
         shown = [
             {
                 **asdict(one.alarm),
@@ -160,17 +165,18 @@ class AlarmBoard(WokenThread):
         self._failed_rules = failed
         return found
 
-    def _raise(self, found: Mapping[tuple[str, str], tuple[Alarm, Rule]], now: Stamp) -> None:
-        self._sighted = {key: self._sighted.get(key, now) for key in found}
+    def _raise(self, found: Mapping[tuple[str, str], tuple[Alarm, Rule]], evidence: Evidence) -> None:
+        now = evidence.now
+        self._sighted = {key: self._sighted.get(key, rule.instant(evidence)) for key, (_, rule) in found.items()}
         for key, (alarm, rule) in found.items():
-            active = self._active.get(key)
+            active, seen = self._active.get(key), rule.instant(evidence)
             if active is not None:
                 is_worse = alarm.severity == "critical" != active.alarm.severity
-                active.alarm, active.seen, active.hold_s = alarm, now, rule.hold_s
+                active.alarm, active.seen, active.hold_s = alarm, seen, rule.hold_s
                 if is_worse:
                     self._report_raised(active, now)
-            elif now.since(self._sighted[key]) >= rule.after_s * NS_PER_S:
-                self._active[key] = _Active(alarm, now, now, rule.hold_s)
+            elif seen.since(self._sighted[key]) >= rule.after_s * NS_PER_S:
+                self._active[key] = _Active(alarm, now, seen, rule.hold_s)
                 self._report_raised(self._active[key], now)
 
     def _report_raised(self, active: _Active, now: Stamp) -> None:
@@ -180,13 +186,14 @@ class AlarmBoard(WokenThread):
         said = alarm.kind, alarm.subject, alarm.text, alarm.remedy
         log.log(_LEVELS[alarm.severity], "alarm %s, %s: %s. %s", *said)
 
-    def _clear(self, found: Mapping[tuple[str, str], object], now: Stamp) -> None:
+    def _clear(self, found: Mapping[tuple[str, str], object], evidence: Evidence) -> None:
+        now, instants = evidence.now, {rule.kind: rule.instant(evidence) for rule in self._rules}
         for key, active in list(self._active.items()):
             if active.alarm.kind in self._failed_rules or active.alarm.kind in self._paused_rules:
                 active.seen = now
             if key in found:
                 continue
-            if now.since(active.seen) >= active.hold_s * NS_PER_S:
+            if instants.get(active.alarm.kind, now).since(active.seen) >= active.hold_s * NS_PER_S:
                 del self._active[key]
                 active.cleared = now
                 self._unwritten.append(active)

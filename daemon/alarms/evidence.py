@@ -89,6 +89,12 @@ class Evidence:
         is_late = acquisition.undecoded_s is None or acquisition.undecoded_s > LATE_S
         return acquisition.error is None and not acquisition.is_write_hung and not is_late
 
+    @property
+    def decoded(self) -> Stamp:
+        """The instant up to which captures have been decoded; it stands still while nothing can be stored."""
+        age_s = self.acquisition.decoded_age_s
+        return self.now.shifted(-round((self.running_s if age_s is None else age_s) * NS_PER_S))
+
     def active_events(self, kind: EventKind, *ended_by: EventKind) -> list[EventStatus]:
         """Return the last events of a kind that are still active: not of code 0, and not ended by a later event.
 

@@ -294,17 +294,26 @@ def daemon_state(status: Mapping[str, Any], version: str) -> Iterator[Finding]:
     else:
         yield Finding("daemon", "good", f"answers, {status['mode']}, version {version}")
     store, acquisition = status["store_health"], status["acquisition"]
-    if store["state"] in ("ok", "checking"):
-        yield Finding("store", "good", f"{status['store']}: {store['text'] or 'no fault is known'}")
-    else:
+    hindrance = acquisition["error"] or (
+        "a write to the store does not end" if acquisition.get("is_write_hung") else None
+    )
+    if hindrance:
+        remedy = "`rigcal alarms` shows what to do; captures wait in memory meanwhile"
+        yield Finding("store", "fault", f"nothing can be stored: {hindrance}", remedy)
+    if store["state"] not in ("ok", "checking"):
         yield Finding(
             "store", "fault", store["text"], "`rigcal store check` checks all of it; see docs/how-to/back-up.md"
         )
+    elif not hindrance:
+        yield Finding("store", "good", f"{status['store']}: {store['text'] or 'no fault is known'}")
     for link in acquisition["links"]:
-        yield _link(link)
-    yield from _channels(acquisition["channels"])
+        yield _link(link, is_storing=not hindrance)
+    late = "the computer does not keep up with decoding: `top` shows what is busy"
+    if hindrance:
+        late = "it is decoded once the store can be written"
+    yield from _channels(acquisition["channels"], late)
     for station in acquisition["stations"]:
-        yield _station(station)
+        yield _station(station, late)
     yield from _time_outs(acquisition)
     yield from _alarms(status["alarms"]["active"])
 
@@ -321,11 +330,13 @@ def _alarms(active: Sequence[Mapping[str, Any]]) -> Iterator[Finding]:
             yield Finding("alarms", state, named, "`rigcal alarms` shows what to do")
 
 
-def _link(link: Mapping[str, Any]) -> Finding:
+def _link(link: Mapping[str, Any], *, is_storing: bool) -> Finding:
     if link["up"] is False:
         return Finding(
             f"link {link['name']}", "fault", link["reason"] or "is closed", "check plug, adapter and its power"
         )
+    if link["up"] and not is_storing:
+        return Finding(f"link {link['name']}", "unknown", "is open; what it receives cannot be stored at present")
     if link["up"] and not link["captures_per_s"]:
         remedy = "check the device's power, the cable, and the bit rate or baud: a wrong rate looks the same"
         return Finding(f"link {link['name']}", "fault", "is open, but receives nothing", remedy)
@@ -335,12 +346,19 @@ def _link(link: Mapping[str, Any]) -> Finding:
     return Finding(f"link {link['name']}", "good", f"{link['captures_per_s']:.0f} captures/s")
 
 
-def _channels(channels: list[Mapping[str, Any]]) -> Iterator[Finding]:
-    """Check joints and signals; channels of one kind that fail for the same reason share a finding."""
+def _channels(channels: list[Mapping[str, Any]], late: str) -> Iterator[Finding]:
+    """Check joints and signals; channels of one kind that fail for the same reason share a finding.
+
+    Args:
+        channels: their states.
+        late: remedy for those whose readings wait to be decoded.
+    """
     groups: dict[tuple[str, str], list[str]] = {}
     for channel in channels:
         if channel["status"] != "ok":
-            since = "never heard" if channel["age_s"] is None else channel_status(channel)
+            since = channel_status(channel)
+            if channel["age_s"] is None and since != LATE:
+                since = "never heard"
             groups.setdefault((channel["kind"], since), []).append(channel["name"])
     if channels and not groups:
         yield Finding("channels", "good", f"all {len(channels)} joints and signals are read")
@@ -348,14 +366,16 @@ def _channels(channels: list[Mapping[str, Any]]) -> Iterator[Finding]:
         state: State = "fault" if kind == "joint" else "warning"
         remedy = "check power and cable; `rigcal status --frames` shows which identifiers are received"
         if since == LATE:
-            remedy = "the computer does not keep up with decoding: `top` shows what is busy"
+            remedy = late
         yield Finding(f"{kind}s", state, f"{since}: {', '.join(names)}", remedy)
 
 
-def _station(station: Mapping[str, Any]) -> Finding:
+def _station(station: Mapping[str, Any], late: str) -> Finding:
     from daemon.acquisition.status.present import LINK_DOWN, SILENT, STARTING
 
     name = f"station {station['name']}"
+    if channel_status(station) == LATE:
+        return Finding(name, "warning", station["sentence"], late)
     if station["age_s"] is None:
         remedy = "check its power, cable, baud and profile ([station] of the configuration)"
         return Finding(name, "fault", "has not answered since the daemon's start", remedy)

@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 import logging
 import sqlite3
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ from starlette.staticfiles import StaticFiles
 
 from daemon.commands import REFUSED, CommandError
 from daemon.store.errors import StoreError
+from daemon.store.files import FileIdentity
 from daemon.store.queries.history import drift_history, misclosure_history, model_changes
 from daemon.store.reader import Reader
 from daemon.web.access import NAME_CHARACTERS, AttemptLimit, Person, Role, TokenFile, role_refusal
@@ -223,7 +224,7 @@ class Page:
         status = await self._daemon.ask("status")
 
         def read() -> dict[str, Any]:
-            with Reader(Path(status["store"])) as reader:
+            with Reader(Path(status["store"]), _file_of(status)) as reader:
                 return {
                     "drift": drift_history(reader, status["rig"]),
                     "misclosures": misclosure_history(reader),
@@ -238,7 +239,8 @@ class Page:
         live = (status["models"] or {}).get("live")
         model = None if live is None else await self._daemon.ask("model.show", {"id": live["id"]})
         session_id = request.path_params["id"]
-        found = await asyncio.to_thread(self._fixes.read, Path(status["store"]), session_id, model)
+        store = Path(status["store"]), _file_of(status)
+        found = await asyncio.to_thread(self._fixes.read, *store, session_id, model)
         if found is None:
             raise Refused(404, f"there is no session {session_id!r:.80}")
         return JSONResponse(found)
@@ -251,6 +253,12 @@ class Page:
         if path is None or not Path(path).is_file():
             raise Refused(404, f"job {wanted:.20} has no report")
         return FileResponse(path, media_type="text/html", headers={"Content-Security-Policy": REPORT_POLICY})
+
+
+def _file_of(status: Mapping[str, Any]) -> FileIdentity | None:
+    """Return the identity of the store that the daemon has open: a different file may have taken its name."""
+    file = status.get("store_file")  # absent from a daemon that still runs after an upgrade
+    return None if file is None else FileIdentity(*file)
 
 
 async def _object(request: Request) -> dict[str, Any]:

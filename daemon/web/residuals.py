@@ -6,6 +6,7 @@ import threading
 from pathlib import Path
 from typing import Any
 
+from daemon.store.files import FileIdentity
 from daemon.store.queries.history import session_fixes
 from daemon.store.reader import Reader
 
@@ -23,11 +24,14 @@ class SessionFixes:
         self._model: tuple[str, Any] | None = None
         self._kept: tuple[_Key, dict[str, Any]] | None = None
 
-    def read(self, store: Path, session_id: str, model: dict[str, Any] | None) -> dict[str, Any] | None:
+    def read(
+        self, store: Path, identity: FileIdentity | None, session_id: str, model: dict[str, Any] | None
+    ) -> dict[str, Any] | None:
         """Return the fixes of a session, oldest first; None if there is no such session.
 
         Args:
             store: the database.
+            identity: identity that the file must have; None for any.
             session_id: ID of the session.
             model: the live model, as `model.show` returns it; None if no model is live.
 
@@ -37,10 +41,10 @@ class SessionFixes:
             residuals, or what they are based on, a sentence; "" for no note.
 
         Raises:
-            StoreError: the store cannot be read.
+            StoreError: the store cannot be read, or the file is a different one.
         """
         sha256 = "" if model is None else str(model["manifest_sha256"])
-        with self._turn, Reader(store) as reader, reader.snapshot():
+        with self._turn, Reader(store, identity) as reader, reader.snapshot():
             fixes = session_fixes(reader, session_id)
             if fixes is None:
                 return None

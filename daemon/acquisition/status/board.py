@@ -208,7 +208,7 @@ class StatusBoard:
             last_lag = self._lags_ns[-1] if lags else 0
             links = [self._link(intake, heard.get(intake.name), defects.get(intake.name), now) for intake in intakes]
             by_name = {link.name: link for link in links}
-            until = self._decoded_until
+            decoded_age_s = None if self._decoded_until is None else _age_s(self._decoded_until, now)
             return AcquisitionStatus(
                 links=links,
                 frames=_frames(summaries),
@@ -225,7 +225,8 @@ class StatusBoard:
                 writer_lag_s=last_lag / NS_PER_S,
                 writer_lag_p99_s=lags[int(0.99 * (len(lags) - 1))] / NS_PER_S if lags else 0.0,
                 error=self._error,
-                undecoded_s=None if until is None else self._clock.real_seconds(_age_s(until, now)),
+                undecoded_s=None if decoded_age_s is None else self._clock.real_seconds(decoded_age_s),
+                decoded_age_s=decoded_age_s,
                 is_behind=is_behind,
                 is_write_hung=is_write_hung,
             )
@@ -270,6 +271,8 @@ class StatusBoard:
         last, age_s = (None, None) if fix is None else (fix.status.value, _age_s(fix.stamp, now))
         status = present_status(last, age_s, expected.timeout_s, *_open(links.get(name)))
         last_lock, reason = ("", "") if fix is None else (fix.lock.value, fix.reason)
+        is_silent = self._is_silent(last, age_s, expected.timeout_s, links.get(name), now)
+        is_late = status == SILENT and not is_silent
         return StationStatus(
             name=name,
             status=status,
@@ -281,8 +284,8 @@ class StatusBoard:
             last_lock=last_lock,
             good_age_s=None if good is None else _age_s(good.stamp, now),
             tilt_ok=None if fix is None else fix.tilt_ok,
-            sentence=station_sentence(status, age_s, last_lock, last or "", reason),
-            is_silent=self._is_silent(last, age_s, expected.timeout_s, links.get(name), now),
+            sentence=station_sentence(status, age_s, last_lock, last or "", reason, is_late=is_late),
+            is_silent=is_silent,
         )
 
     def _is_silent(

@@ -110,7 +110,9 @@ def is_present(status: str) -> bool:
     return status not in (STARTING, SILENT, LINK_DOWN)
 
 
-def station_sentence(status: str, age_s: float | None, last_lock: str, last_status: str, reason: str) -> str:
+def station_sentence(
+    status: str, age_s: float | None, last_lock: str, last_status: str, reason: str, *, is_late: bool = False
+) -> str:
     """Return the state of a station in one clause, such as `locked, ok, 0 s ago`.
 
     Args:
@@ -119,11 +121,13 @@ def station_sentence(status: str, age_s: float | None, last_lock: str, last_stat
         last_lock: lock of its last record.
         last_status: status of its last record.
         reason: reason in its last record; "" if it has none.
+        is_late: whether newer records may wait to be stored or decoded, so that it is not known to be silent.
     """
-    words = {STARTING: "nothing received yet", SILENT: "silent", LINK_DOWN: "link down"}
+    words = {STARTING: "nothing received yet", SILENT: "late" if is_late else "silent", LINK_DOWN: "link down"}
+    done = "decoded" if is_late else "received"
     if age_s is None:
-        return words[status] if status == STARTING else f"{words[status]}, nothing received since the start"
+        return words[status] if status == STARTING else f"{words[status]}, nothing {done} since the start"
     last = f"{last_lock}, {last_status}" + (f" ({reason})" if reason else "")
     if is_present(status):
         return f"{last}, {duration(age_s)} ago"
-    return f"{words[status]}, nothing received for {duration(age_s)} (last: {last})"
+    return f"{words[status]}, nothing {done} for {duration(age_s)} (last: {last})"

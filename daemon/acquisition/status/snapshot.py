@@ -213,6 +213,7 @@ class AcquisitionStatus:
         writer_lag_p99_s: 99th percentile of this age over the last minute's batches.
         error: why data cannot be stored at present; None if they can.
         undecoded_s: how far decoding is behind, in real seconds; None until captures of this run are decoded.
+        decoded_age_s: the same as an age, in seconds of rigcal's clock: whether devices are silent is known up to then.
         is_behind: captures wait in the store to be decoded, as after a kill: readings and fixes are late.
         is_write_hung: a write to the store does not end; its disk does not answer, or another program holds a lock.
     """
@@ -231,6 +232,7 @@ class AcquisitionStatus:
     writer_lag_p99_s: float = 0.0
     error: str | None = None
     undecoded_s: float | None = 0.0
+    decoded_age_s: float | None = 0.0
     is_behind: bool = False
     is_write_hung: bool = False
 

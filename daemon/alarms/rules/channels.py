@@ -27,6 +27,7 @@ _WHY = {
     "Check that the machine is on, and check the cable between bus and adapter.",
     after_s=1,
     hold_s=3,
+    is_of_decoded=True,
 )
 def link_silent(evidence: Evidence) -> Iterator[Finding]:
     """A CAN link has been open for 5 s, but no frame has arrived on it since its silent channels were last received.
@@ -44,6 +45,7 @@ def link_silent(evidence: Evidence) -> Iterator[Finding]:
     "Check the encoder's power and cable; without this joint no fix can be used.",
     after_s=1.0,
     hold_s=3.0,
+    is_of_decoded=True,
 )
 def joint_silent(evidence: Evidence) -> Iterator[Finding]:
     """No reading of a joint has arrived for 1 s longer than its timeout, and its link has been open for 5 s.
@@ -58,6 +60,7 @@ def joint_silent(evidence: Evidence) -> Iterator[Finding]:
     "Check the signal's device and cable; effects that need this signal cannot be identified.",
     after_s=1.0,
     hold_s=3.0,
+    is_of_decoded=True,
 )
 def signal_silent(evidence: Evidence) -> Iterator[Finding]:
     """No reading of a machine signal has arrived for 1 s longer than its timeout.
@@ -116,8 +119,9 @@ def _is_quiet(evidence: Evidence, link: str, channels: list[ChannelStatus]) -> b
 
 
 def _has_started(evidence: Evidence, channel: ChannelStatus) -> bool:
+    """Return True if the channel's link had been open long enough when the newest decoded capture was received."""
     link = evidence.link_of(channel.name)
-    return link is None or link.since_s >= START_S
+    return link is None or link.since_s - (evidence.acquisition.decoded_age_s or 0.0) >= START_S
 
 
 def _silent(evidence: Evidence, kind: str) -> Iterator[Finding]:

@@ -11,7 +11,11 @@ WITHOUT_FIX_S = 600.0
 LONG_S = 86_400.0
 
 
-@rule("warning", "Describe the station's new set-up with `rigcal setup new`, and hold a new session.")
+@rule(
+    "warning",
+    "End what is open: a guide with `rigcal session guide --stop REASON`, otherwise a session with "
+    "`rigcal session stop`. Then describe the station's new set-up with `rigcal setup new`, and hold a new session.",
+)
 def setup_moved(evidence: Evidence) -> Iterator[Finding]:
     """The station's set-up has moved: a control point is no longer where it was.
 
@@ -96,7 +100,13 @@ def model_drifted(evidence: Evidence) -> Iterator[Finding]:
         )
 
 
-@rule("critical", "Make an earlier model live with `rigcal model rollback`, or calibrate again.", hold_s=10.0)
+@rule(
+    "critical",
+    "`rigcal model list` shows the other models: one that was live before goes live again with "
+    "`rigcal model rollback NUMBER`, a candidate with `rigcal model compare NUMBER` and then "
+    "`rigcal model accept NUMBER`. Or calibrate again.",
+    hold_s=10.0,
+)
 def model_unusable(evidence: Evidence) -> Iterator[Finding]:
     """The live model is damaged or belongs to another rig file: there is no tip.
 

@@ -17,6 +17,7 @@ _TURNED_AWAY = (LockState.STANDBY, LockState.SEARCHING, LockState.WAITING, LockS
     "critical",
     "Check that the station is on; check its cable and its settings (baud rate, parity, line end).",
     hold_s=3.0,
+    is_of_decoded=True,
 )
 def station_silent(evidence: Evidence) -> Iterator[Finding]:
     """A station has sent no records for longer than its timeout, and none of its captures wait to be decoded.

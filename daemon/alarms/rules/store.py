@@ -12,7 +12,12 @@ CRITICAL_BYTES = 200 * 2**20
 OVERDUE_NS = 3 * 86_400 * NS_PER_S
 
 
-@rule("critical", "Free space on the disk, or check the disk. Until then captures are held in memory.", hold_s=5.0)
+@rule(
+    "critical",
+    "Free space on a full disk, end the program that locks the store, or check the disk, as the alarm says. Until then "
+    "captures are held in memory.",
+    hold_s=5.0,
+)
 def not_storing(evidence: Evidence) -> Iterator[Finding]:
     """Nothing can be written to the store.
 

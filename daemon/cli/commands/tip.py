@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from daemon.cli.client import client_options, socket_of
+from daemon.cli.client import STATUS_TIMEOUT_S, client_options, socket_of
 from daemon.cli.command import DONE, FAILED, Command, Delivered, stream_json
 from daemon.cli.terminal import echo, echo_error
 from daemon.control.protocol import request
@@ -31,7 +31,7 @@ def tip(prism: str | None, *, follow: bool, **where: Any) -> Any:
     arguments = {} if prism is None else {"prism": prism}
     socket = socket_of(where["socket"], where["config"])
     if not follow:
-        result = request(socket, "tip", arguments)
+        result = request(socket, "tip", arguments, timeout_s=STATUS_TIMEOUT_S)
         is_known = result["base_mm"] is not None
         if is_known and not where["as_json"]:
             _show(result)
@@ -40,7 +40,7 @@ def tip(prism: str | None, *, follow: bool, **where: Any) -> Any:
         return Delivered(result, DONE if is_known else FAILED)
     try:
         while True:
-            result = request(socket, "tip", arguments)
+            result = request(socket, "tip", arguments, timeout_s=STATUS_TIMEOUT_S)
             if where["as_json"]:
                 stream_json(result)
             else:

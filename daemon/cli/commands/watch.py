@@ -38,7 +38,7 @@ WIDTH = 100
 def watch(interval_s: float, count: int | None, **where: Any) -> None:
     """Show the rig's state continuously until Ctrl-C.
 
-    The state has joints, station, rates, open session, alarms and jobs. On a terminal the screen is updated. Otherwise
+    The state has alarms, joints, station, rates, open session and jobs. On a terminal the screen is updated. Otherwise
     each update is one line, with --json one object. If the daemon does not answer, this is shown, and the connection is
     retried.
     """

@@ -75,7 +75,7 @@ def gap_state_lines(acquisition: Mapping[str, Any]) -> Iterator[str]:
 
 
 def channel_status(channel: Mapping[str, Any]) -> str:
-    """Return the status of a joint or signal in words. One whose readings wait to be decoded is late, not silent."""
+    """Return the status of a joint, signal or station in words. One whose records wait to be decoded is late."""
     if channel["status"] == "silent" and not channel["is_silent"]:
         return LATE
     return str(channel["status"]).replace("_", " ")

@@ -75,22 +75,21 @@ def summary(status: Mapping[str, Any], width: int, lines: int = LINES, *, with_j
     version = f", rigcal {status['version']}" if "version" in status else ""
     head = _labelled("rig", [f"{status['rig']} ({status['mode']}){version}, store {status['store']}"], width)
     head += _labelled("state", [state_sentence(status)], width, bold=True)
-    if with_joints:
-        head += _joints(status["acquisition"]["channels"], width)
+    joints = _joints(status["acquisition"]["channels"], width) if with_joints else []
     end = _labelled("next", [next_line(status)], width, bold=True)
     gaps = _entries("gaps", _gaps(status["acquisition"]), width)
     body = [entry for label, texts in _body(status) for entry in _entries(label, texts, width)]
-    room = lines - len(head) - len(end)
+    room = lines - len(head) - len(joints) - len(end)
     kept = sum(map(len, gaps[:_GAPS_KEPT])) + 1  # and a line that counts the omitted lines
     alarms = _alarms(status["alarms"]["active"], width, room - kept)
     told = _fitted([*gaps, *body], room - len(alarms), "... {} more lines: `rigcal status --all` shows them", width)
-    return [*head, *alarms, *told, *end]
+    return [*head, *alarms, *joints, *told, *end]
 
 
 def reading(channel: Mapping[str, Any]) -> str:
     """Return the current value of a channel with its unit, or the reason why there is none."""
     if channel["value"] is None:
-        return str(channel["status"]).replace("_", " ")
+        return channel_status(channel).partition(",")[0]  # only the first words fit beside other channels
     return f"{channel['value']:.3f} {channel['unit']}"
 
 

@@ -284,3 +284,40 @@ def test_alarms_of_silent_devices_neither_end_nor_begin_while_the_disk_does_not_
         assert ("cleared", "joint_silent") not in told
         now = replace(seen, channels=[replace(one, status="ok", is_silent=False) for one in seen.channels])
         assert looked(10) == []
+
+
+def test_no_alarm_of_silence_is_raised_or_ends_by_time_in_which_nothing_is_decoded(tmp_path: Path) -> None:
+    clock = ManualClock(at(0))
+    heard = ChannelStatus("theta1", "deg", 1.0, "ok", 0.1, "ok", "boom", "joint")
+    silent = replace(heard, value=None, status="silent", age_s=2.0, is_silent=True)
+    channel, decoded_age_s = silent, 0.0
+
+    def looked(seconds: int, *, is_decoded: bool) -> list[str]:
+        nonlocal decoded_age_s
+        for _ in range(seconds):
+            clock.advance(1.0)
+            decoded_age_s = 0.0 if is_decoded else decoded_age_s + 1.0
+            board.evaluate()
+        return [alarm["kind"] for alarm in board.status()["active"] if alarm["subject"] == "theta1"]
+
+    def gather() -> Evidence:
+        links = [LinkStatus("boom", up=True, since_s=99.0)]
+        acquisition = AcquisitionStatus(links=links, channels=[channel], decoded_age_s=decoded_age_s)
+        return Evidence(clock.now(), running_s=99.0, acquisition=acquisition)
+
+    with contextlib.closing(Store(tmp_path / "rigcal.sqlite")) as store:
+        board = AlarmBoard(AlarmTable(store), gather, clock)
+        assert looked(1, is_decoded=True) == []
+        assert looked(20, is_decoded=False) == []
+        assert looked(1, is_decoded=True) == ["joint_silent"]
+        channel = heard
+        assert looked(1, is_decoded=True) == ["joint_silent"]
+        assert looked(20, is_decoded=False) == ["joint_silent"]
+        assert looked(3, is_decoded=True) == []
+
+
+def test_a_store_that_cannot_be_written_is_told_before_older_critical_alarms(tmp_path: Path) -> None:
+    rig = Rig(tmp_path / "rigcal.sqlite", [unplugged, replace(unplugged, kind="not_storing")])
+    with contextlib.closing(rig.store):
+        rig.pass_s(3, boom="gone")
+        assert [alarm["kind"] for alarm in rig.board.status()["active"]] == ["not_storing", "unplugged"]

@@ -509,3 +509,13 @@ def test_an_alarm_says_its_subject_once_and_in_what_to_type() -> None:
     assert "`rigcal jobs retry 7`" in job.remedy
     (lost,) = rules["frames_lost"](known(replace(event(E.FRAMES_DROPPED), text="boom: 3 frames lost")))
     assert (lost.subject, lost.text) == ("boom", "3 frames lost")
+
+
+def test_no_remedy_recommends_a_command_that_is_refused_in_the_state_that_raises_the_alarm() -> None:
+    (unusable,) = raised("model_unusable", known(model=LiveModelHealth(1, defect="damaged")))
+    assert "`rigcal model rollback`" not in unusable.remedy, "it is refused where the live model has no predecessor"
+    commands = ("model list", "model rollback NUMBER", "model compare NUMBER", "model accept NUMBER")
+    assert all(f"`rigcal {command}`" in unusable.remedy for command in commands)
+    (moved,) = raised("setup_moved", known(setup=SetupRow("S2", "moved"), session=SESSION))
+    stops = [moved.remedy.index(f"`rigcal session {command}`") for command in ("guide --stop REASON", "stop")]
+    assert max(stops) < moved.remedy.index("`rigcal setup new`"), "it is refused while a guide or session is open"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import os
 import re
+import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -14,6 +15,7 @@ from click.testing import CliRunner
 
 from daemon.cli import commands
 from daemon.cli.client import socket_of
+from daemon.cli.commands import tip
 from daemon.cli.main import main
 from daemon.commands import INSTALLED_SOCKET
 from tests.daemon.support.idle_daemon import idle_daemon
@@ -106,6 +108,19 @@ def test_a_reader_that_has_ended_is_no_error(tmp_path: Path) -> None:
     os.close(writing)
     assert done.returncode == 1
     assert done.stderr == ""
+
+
+@pytest.mark.parametrize("options", [[], ["--follow"]])
+def test_a_tip_waits_for_a_daemon_that_hangs_no_longer_than_the_status_does(
+    options: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tip, "STATUS_TIMEOUT_S", 0.1)
+    with socket.socket(socket.AF_UNIX) as hangs:
+        hangs.bind(str(tmp_path / "control.sock"))
+        hangs.listen()
+        failed = CliRunner().invoke(main, ["tip", *options, "--socket", str(tmp_path / "control.sock")])
+    assert failed.exit_code == 1
+    assert "did not answer within 0.1 s: it hangs" in failed.stderr
 
 
 def test_help_loads_nothing_heavy() -> None:

@@ -149,7 +149,15 @@ def told(*, alarms: Sequence[Mapping[str, str]] = (), **acquisition: Any) -> lis
         "store": "/x",
         "store_health": {"state": "ok", "text": ""},
         "alarms": {"active": alarms},
-        "acquisition": {"links": [], "channels": [], "stations": [], "gap_counts": [], **acquisition},
+        "acquisition": {
+            "links": [],
+            "channels": [],
+            "stations": [],
+            "gap_counts": [],
+            "error": None,
+            "is_write_hung": False,
+            **acquisition,
+        },
     }
     return list(daemon_state(status, "0.2.0"))
 
@@ -197,7 +205,7 @@ def test_a_busy_processor_is_named_before_the_rig_file(monkeypatch: pytest.Monke
     [("link_down", "the plug, the cable"), ("silent", "power and cable"), ("not_locked", "aim it at the prism")],
 )
 def test_the_remedy_for_a_station_follows_its_state(status: str, remedy: str) -> None:
-    station = {"name": "station", "age_s": 12.0, "status": status, "sentence": status}
+    station = {"name": "station", "age_s": 12.0, "status": status, "sentence": status, "is_silent": True}
     found = only(told(stations=[station]), "station station")
     assert (found.state, remedy in found.remedy) == ("warning", True)
     assert ("aim" in found.remedy) == (status == "not_locked")
@@ -209,3 +217,18 @@ def test_alarms_that_only_warn_are_no_fault() -> None:
     shown = [(f.state, f.text) for f in told(alarms=[critical, warning]) if f.subject == "alarms"]
     assert shown == [("fault", "link_down boom"), ("warning", "disk_low disk")]
     assert [f.state for f in told(alarms=[warning]) if f.subject == "alarms"] == ["warning"]
+
+
+@pytest.mark.parametrize("hindrance", [{"error": "/x: locked by another program"}, {"is_write_hung": True}])
+def test_while_nothing_can_be_stored_the_store_is_at_fault_and_no_device_or_link(hindrance: dict[str, Any]) -> None:
+    link = {"name": "boom", "up": True, "captures_per_s": 0.0, "dropped": 0, "reason": ""}
+    late = {"name": "theta1", "kind": "joint", "status": "silent", "is_silent": False, "age_s": 9.0}
+    never = {**late, "name": "theta3", "age_s": None}
+    station = {**late, "name": "ts1", "sentence": "late, nothing decoded for 9 s"}
+    findings = told(links=[link], channels=[late, never], stations=[station], **hindrance)
+    assert [f.subject for f in findings if f.state == "fault"] == ["store", "joints"]
+    assert only(findings, "store").text.startswith("nothing can be stored: ")
+    assert only(findings, "link boom").state == "unknown"
+    assert only(findings, "joints").text == "late, not yet decoded: theta1, theta3"
+    for subject in ("link boom", "joints", "station ts1"):
+        assert "cable" not in only(findings, subject).remedy

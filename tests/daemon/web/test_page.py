@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 
 from daemon.config.config import Config
+from daemon.store import Store
 from daemon.store.reader import Reader
 from daemon.web.server import REQUEST_S
 from tests.daemon.support.idle_daemon import idle_daemon
@@ -357,3 +358,16 @@ def test_history_and_fixes_of_a_store_that_is_new(page: WebProcess) -> None:
     assert page.get("/api/sessions/none/fixes").status == 404
     assert page.get("/report/7").status == 404
     assert page.get("/static/../app.py").status == 404
+
+
+def test_no_other_file_is_read_in_place_of_the_daemons_store(tmp_path: Path) -> None:
+    with idle_daemon(tmp_path) as config:
+        web = WebProcess(written(tmp_path))
+        try:
+            Store(tmp_path / "other.sqlite").close()
+            (tmp_path / "other.sqlite").replace(config.store_path)
+            for path in ("/api/history", "/api/sessions/none/fixes"):
+                answer = web.get(path)
+                assert (answer.status, "not the store that the daemon writes to" in answer.data["error"]) == (502, True)
+        finally:
+            assert web.stop() == 0

@@ -30,7 +30,7 @@ def test_fixes_have_the_live_models_residuals_and_excluded_ones_have_none(measur
     sha256 = model_sha256(directory)
     live = {"id": 7, "path": str(directory), "manifest_sha256": sha256}
     store = measured.config.store_path
-    found = SessionFixes().read(store, "a", live)
+    found = SessionFixes().read(store, None, "a", live)
     model = read_model(directory, sha256)
     with Reader(store) as reader:
         rows = parse_observations(sessions_csv(reader, model.rig, ["a"]), model.rig, "a")
@@ -41,14 +41,14 @@ def test_fixes_have_the_live_models_residuals_and_excluded_ones_have_none(measur
 
 
 def test_without_a_live_model_the_fixes_come_alone(measured: JobRig) -> None:
-    found = SessionFixes().read(measured.config.store_path, "a", None)
+    found = SessionFixes().read(measured.config.store_path, None, "a", None)
     assert [fix["residual_mm"] for fix in found["fixes"]] == [None] * len(found["fixes"])
     assert "No model is live" in found["note"]
 
 
 def test_a_model_that_cannot_be_read_is_said(measured: JobRig, tmp_path: Path) -> None:
     live = {"id": 7, "path": str(tmp_path / "gone"), "manifest_sha256": "ab"}
-    found = SessionFixes().read(measured.config.store_path, "a", live)
+    found = SessionFixes().read(measured.config.store_path, None, "a", live)
     assert "No residuals" in found["note"]
 
 

@@ -36,6 +36,9 @@ export function utc(ns) {
 
 export const words = (name) => String(name).replaceAll("_", " ").replaceAll("-", " ");
 
+/** The status of a joint or signal in words; one whose readings wait to be decoded is late, not silent. */
+export const channelStatus = ({ status, is_silent: isSilent }) => (status === "silent" && !isSilent ? "late, not yet decoded" : words(status));
+
 export const plural = (n, one, more = `${one}s`) => `${n} ${n === 1 ? one : more}`;
 
 /** Poses of a guide's plan as a tile; a session has more poses if the boom also stood elsewhere. */

@@ -13,6 +13,8 @@ from daemon.acquisition.acquisition import Acquisition
 from daemon.acquisition.status.decode_failures import KINDS_MAX, FailureCounter
 from daemon.acquisition.status.present import Expected, ExpectedChannel, ExpectedStation, expected_of
 from daemon.acquisition.status.snapshot import AcquisitionStatus
+from daemon.alarms.evidence import Evidence
+from daemon.alarms.library import library
 from daemon.cli.lines.state import decoding_lines, gap_state_lines, station_line
 from daemon.config.config import Config
 from daemon.host.safe_output import duration
@@ -122,6 +124,30 @@ def test_a_device_is_silent_only_once_nothing_of_it_can_wait_for_the_disk(rig: R
     assert silent() == ["theta3", "ts1"]
 
 
+def test_devices_that_are_still_starting_when_the_disk_hangs_raise_no_alarm_of_silence(rig: Rig) -> None:
+    def found() -> list[str]:
+        evidence = Evidence(rig.clock.now(), running_s=100.0, acquisition=rig.status())
+        return [alarm.subject for rule in library() for alarm in rule(evidence) if "silent" in alarm.kind]
+
+    rig.hear(UP, frame(7, 0.0))
+    rig.clock.advance(3.0)
+    rig.hear(frame(7, 3.0))  # theta3 starts later
+    assert found() == []
+    with rig.store.transaction():
+        rig.clock.advance(10.0)
+        assert found() == []
+    wait_until(lambda: found() == ["boom", "ts1"])
+
+
+def test_a_station_whose_records_wait_for_the_disk_is_called_late_and_not_silent(rig: Rig) -> None:
+    rig.hear(UP)
+    wait_until(lambda: rig.status().stations[0].fixes == 1)
+    with rig.store.transaction():
+        rig.clock.advance(40.0)
+        assert rig.status().stations[0].sentence == "late, nothing decoded for 40 s (last: locked, ok)"
+    wait_until(lambda: rig.status().stations[0].sentence.startswith("silent, nothing received for 40 s"))
+
+
 def test_channels_of_an_unplugged_bus_are_not_ok(rig: Rig) -> None:
     rig.hear(UP, frame(7, 0.0))
     rig.clock.advance(0.1)
@@ -147,6 +173,7 @@ def test_a_silent_station_is_not_locked_and_its_last_fix_not_ok(rig: Rig) -> Non
         "station ts1: locked, ok, 0 s ago; 1 fixes"
     )
     rig.clock.advance(40.0)
+    wait_until(lambda: rig.status().stations[0].is_silent)
     (station,) = rig.status().stations
     assert (station.status, station.lock, station.good_age_s) == ("silent", "unknown", pytest.approx(40.0))
     assert station.sentence == "silent, nothing received for 40 s (last: locked, ok)"
@@ -157,6 +184,7 @@ def test_why_no_fix_can_arrive_is_known(rig: Rig) -> None:
     wait_until(lambda: rig.status().stations[0].fixes == 1)
     assert rig.status().why_no_fix() is None
     rig.clock.advance(40.0)
+    wait_until(lambda: rig.status().stations[0].is_silent)
     assert rig.status().why_no_fix() == "ts1: silent, nothing received for 40 s (last: locked, ok)"
     assert AcquisitionStatus(error="the disk is full").why_no_fix() == "nothing can be stored: the disk is full"
     assert AcquisitionStatus(is_write_hung=True).why_no_fix() == "a write to the store does not end"

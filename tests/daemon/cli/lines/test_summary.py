@@ -175,6 +175,17 @@ def test_a_joint_whose_readings_wait_to_be_decoded_is_late_and_not_silent() -> N
     assert "silent: theta0" in text
 
 
+def test_watch_tells_of_an_alarm_on_the_smallest_terminal_and_calls_late_joints_late() -> None:
+    told = status(alarms=WORST["alarms"])
+    lines = [line.text for line in summary(told, 60, 6, with_joints=True)]
+    assert any("CRITICAL joint_silent theta0" in line for line in lines[:6])
+    order = [line.split()[0] for line in lines if not line.startswith(" ")]
+    assert order.index("alarms") < order.index("joints") < order.index("next")
+    joints = [dict(joint, status="silent", value=None) for joint in acquired()["channels"]]
+    wide = summary(status(acquisition=acquired(channels=joints)), 100, with_joints=True)
+    assert any("theta0 late " in line.text for line in wide)
+
+
 def test_a_job_that_runs_is_told_before_those_that_wait() -> None:
     waiting = WORST["jobs"]
     text = screen(status(jobs=[*waiting, waiting[0] | {"id": 99, "state": "running"}]))

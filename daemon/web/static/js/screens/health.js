@@ -4,7 +4,7 @@ import { command } from "../api.js";
 import { alarmList } from "../alarms.js";
 import { fill, h, say, tile } from "../dom.js";
 import { jobCard } from "../jobs.js";
-import { duration, fixed, measured, unitName, utc, words } from "../words.js";
+import { channelStatus, duration, fixed, measured, unitName, utc, words } from "../words.js";
 
 const JOBS_SHOWN = 8;
 
@@ -93,7 +93,7 @@ function agedRows(body, channels, app) {
     const cells = body.rows[i].cells;
     say(cells[0], channel.name);
     cells[1].className = `text ${channel.status === "ok" ? "good" : "bad"}`;
-    say(cells[1], words(channel.status));
+    say(cells[1], channelStatus(channel));
     const age = app.live.ageOf(channel.age_s);
     cells[2].classList.toggle("old", age === null || age > 2 || !app.live.isLive);
     say(cells[2], channel.value === null ? "\u2013" : `${measured(channel.value, channel.unit)}${unitName(channel.unit)}`);
