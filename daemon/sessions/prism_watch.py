@@ -207,8 +207,9 @@ class PrismWatch:
             self._store.once_committed(partial(session.confirmations.append, OperatorConfirmation(at)))
         log.info("session %s: %s", session.id, text)
         advice = [
-            f"fixes that {suspicion.station} measured before its target jumped by {suspicion.distance_m:.2f} m are "
-            "also used: if it was on another prism then, abort the session and hold a new one"
+            f"fixes that {suspicion.station} measured before its target jumped by {suspicion.distance_m:.2f} m stay in "
+            "use: if it was on another prism then, reject the session after its end: `rigcal session reject "
+            f"{session.id}`"
             for suspicion in ended
         ]
         return {

@@ -111,7 +111,7 @@ class StationSetups:
             if current.state != "ok":
                 raise CommandError(
                     f"the current set-up {current.id!r} has {current.state}; describe a new one with "
-                    "`rigcal setup new`, or name an earlier one with --setup if the station stands there again",
+                    "`rigcal setup new`, or name another one with --setup if the station stands there again",
                     REFUSED,
                 )
             return current.id

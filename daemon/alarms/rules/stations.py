@@ -80,8 +80,8 @@ def instrument_error(evidence: Evidence) -> Iterator[Finding]:
 
 @rule(
     "critical",
-    "Aim the station at the session's prism. If it is already on that prism, check that no joint's zero has changed, "
-    "and run `rigcal session confirm-prism`.",
+    "Aim the station at the session's prism. If the alarm stays although the station is on that prism, check that no "
+    "joint's zero has changed, and run `rigcal session confirm-prism`.",
 )
 def prism_jump(evidence: Evidence) -> Iterator[Finding]:
     """While a session is open, a station's target has jumped further than a boom can move.

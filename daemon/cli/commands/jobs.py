@@ -8,7 +8,7 @@ import click
 
 from daemon.cli.client import ask, client_options
 from daemon.cli.command import Command
-from daemon.cli.lines.jobs import show_jobs
+from daemon.cli.lines.jobs import show_jobs, waiting_for
 from daemon.cli.terminal import echo
 
 
@@ -29,9 +29,13 @@ def jobs_list(**where: Any) -> Any:
     """
     silent = where | {"as_json": True}
     found = ask(silent, "jobs.list", echo)
-    without = [session for session in ask(silent, "session.list", echo)["result"] if session.get("no_job")]
+    sessions = ask(silent, "session.list", echo)["result"]
+    without = [session for session in sessions if session.get("no_job")]
     if not where["as_json"]:
         show_jobs(found["result"], without)
+        opened = next((session for session in sessions if session["state"] == "open"), None)
+        if opened is not None and any(job["state"] == "queued" for job in found["result"]):
+            echo(f"each queued job {waiting_for(opened)}")
         if not found["result"] and not without:
             echo("no jobs yet: jobs are queued after a session is closed; `rigcal session start` opens a session")
     return found | {"without_job": [{key: session[key] for key in ("id", "no_job")} for session in without]}

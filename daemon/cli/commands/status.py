@@ -12,7 +12,7 @@ import click
 from daemon.cli.client import STATUS_TIMEOUT_S, ask, client_options, utc
 from daemon.cli.command import Command
 from daemon.cli.lines.clock import clock_sentence, latency_sentence
-from daemon.cli.lines.jobs import job_line
+from daemon.cli.lines.jobs import job_lines
 from daemon.cli.lines.state import (
     channel_status,
     decoding_lines,
@@ -68,7 +68,7 @@ def _show_all(status: Mapping[str, Any], *, frames: bool) -> None:
         echo(f"latency of the station's fixes in {status['latency']['session']}: {latency_sentence(status['latency'])}")
     if status["session"]:
         show_session(status["session"])
-    for line in map(job_line, status["jobs"]):
+    for line in job_lines(status):
         echo(line)
     models, gap = status["models"], status["gap"]
     for line in (*(model_lines(models) if models else ()), *(gap_lines(gap) if gap else ())):

@@ -14,7 +14,7 @@ import click
 
 from daemon.cli.client import STATUS_TIMEOUT_S, client_options, socket_of
 from daemon.cli.command import Command, stream_json
-from daemon.cli.lines.jobs import job_line
+from daemon.cli.lines.jobs import job_lines
 from daemon.cli.lines.summary import LINES, Line, reading, state_sentence, summary
 from daemon.cli.terminal import begin_screen, draw_screen, echo, end_screen
 from daemon.commands import CommandError
@@ -75,7 +75,7 @@ def one_line(status: Mapping[str, Any]) -> str:
         f"{channel['name']} {reading(channel)}" for channel in acquisition["channels"] if channel["kind"] == "joint"
     ]
     parts += [f"{station['name']}: {station['sentence']}" for station in acquisition["stations"]]
-    parts += [job_line(job) for job in status["jobs"]]
+    parts += job_lines(status)
     named = ", ".join(f"{alarm['kind']} {alarm['subject']}" for alarm in alarms)
     parts.append(f"alarms: {named}" if alarms else "no alarms")
     return "; ".join(parts)

@@ -12,8 +12,19 @@ from daemon.report.words import number
 _COLOURS = {"done": "green", "failed": "red", "interrupted": "yellow", "cancelled": "yellow"}
 
 
-def job_line(job: Mapping[str, Any]) -> str:
-    """Return a job's state in one line, with its progress, error or result."""
+def job_lines(status: Mapping[str, Any]) -> list[str]:
+    """Return a line for each unfinished job of the daemon's status, the running one first."""
+    jobs = sorted(status["jobs"], key=lambda job: job["state"] != "running")
+    waits = waiting_for(status["session"])
+    return [_line(job) + (f", {waits}" if waits and job["state"] == "queued" else "") for job in jobs]
+
+
+def waiting_for(session: Mapping[str, Any] | None) -> str:
+    """Return what queued jobs wait for while a session is open; "" while none is."""
+    return f"begins when session {session['id']} has ended" if session is not None else ""
+
+
+def _line(job: Mapping[str, Any]) -> str:
     name = f"job {job['id']} {job['kind']}" + (f" of {job['session_id']}" if job.get("session_id") else "")
     told = outcome(job)
     return f"{name}: {job['state']}" + (f", {told}" if told else "")

@@ -10,7 +10,7 @@ import textwrap
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
-from daemon.cli.lines.jobs import job_line
+from daemon.cli.lines.jobs import job_lines
 from daemon.cli.lines.state import (
     alarm_line,
     channel_status,
@@ -122,7 +122,6 @@ def _gaps(acquisition: Mapping[str, Any]) -> list[str]:
 def _body(status: Mapping[str, Any]) -> Iterator[tuple[str, list[str]]]:
     acquisition, models, gap = status["acquisition"], status["models"], status["gap"]
     failing = sorted(acquisition["decoding"], key=lambda device: -device["lately"])
-    jobs = sorted(status["jobs"], key=lambda job: job["state"] != "running")
     yield "links", [_links(acquisition["links"])]
     yield "channels", [_channels(acquisition["channels"])]
     yield "station", [f"{s['name']}: {s['sentence']}; {s['fixes']} fixes" for s in acquisition["stations"]]
@@ -130,7 +129,7 @@ def _body(status: Mapping[str, Any]) -> Iterator[tuple[str, list[str]]]:
     yield "decoding", _first([*decoding_lines(failing)], _DEVICES_SHOWN, "`rigcal status --all` shows all")
     if status["session"]:
         yield "session", list(_session(status["session"]))
-    yield "jobs", _first([job_line(job) for job in jobs], _JOBS_SHOWN, "`rigcal jobs list` shows all")
+    yield "jobs", _first(job_lines(status), _JOBS_SHOWN, "`rigcal jobs list` shows all")
     yield "models", model_lines(models) if models else []
     if gap and gap["verdict"] is not None:
         yield "verdict", [f"{gap['verdict']['sentence']} (session {gap['verdict']['session']})"]

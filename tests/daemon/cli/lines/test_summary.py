@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 from click.testing import CliRunner
 
-from daemon.cli.lines.jobs import job_line, outcome, percent
+from daemon.cli.lines.jobs import job_lines, outcome, percent
 from daemon.cli.lines.summary import LINES, state_sentence, summary
 from daemon.cli.main import main
 from daemon.next_step import next_line
@@ -192,6 +192,13 @@ def test_a_job_that_runs_is_told_before_those_that_wait() -> None:
     assert "jobs      job 99 gap of s: running" in text
 
 
+def test_jobs_that_wait_for_the_end_of_a_session_say_so() -> None:
+    queued = {"id": 2, "kind": "report", "session_id": "s1", "state": "queued", "error": None, "progress": 0.0}
+    assert job_lines({"jobs": [queued], "session": None}) == ["job 2 report of s1: queued"]
+    told = "job 2 report of s1: queued, begins when session s2 has ended"
+    assert job_lines({"jobs": [queued], "session": {"id": "s2"}}) == [told]
+
+
 CANDIDATE = {
     "id": 2,
     "stage": "hybrid",
@@ -251,7 +258,8 @@ def test_the_state_is_one_sentence() -> None:
 
 def test_a_job_that_runs_never_stands_at_100_percent() -> None:
     job = {"id": 1, "kind": "gap", "session_id": "s1", "state": "running", "error": None, "progress": 1.0}
-    assert job_line(job | {"message": "drawing"}) == "job 1 gap of s1: running, 99 %: drawing"
+    lines = job_lines({"jobs": [job | {"message": "drawing"}], "session": None})
+    assert lines == ["job 1 gap of s1: running, 99 %: drawing"]
     assert [percent(share) for share in (0.0, 0.994, 0.999, 1.0)] == ["0 %", "99 %", "99 %", "99 %"]
 
 
