@@ -12,7 +12,7 @@ from daemon.alarms.board import AlarmBoard
 from daemon.commands import FAILED, REFUSED, CommandError, Handler, raise_if_cancelled, reading_socket, text_argument
 from daemon.composition import Parts
 from daemon.config.config import Config
-from daemon.control.command_table import checked_arguments
+from daemon.control.command_table import COMMANDS, checked_arguments
 from daemon.control.protocol import reading_only
 from daemon.control.server import ControlServer
 from daemon.guide.manager import GuideManager
@@ -36,6 +36,21 @@ GUARDED = (
     "session.abort",
     "session.shoot",
 )  # refused while a guide is open
+ENDING = ("session.stop", "session.abort")
+# Carried out also while the store's file is missing or replaced: they end or carry on what is open, or store nothing.
+UNGUARDED = (
+    *ENDING,
+    "session.shoot",
+    "session.confirm-prism",
+    "guide.done",
+    "guide.skip",
+    "guide.more",
+    "guide.stop",
+    "alarms.test-notice",
+    "devices.configure",
+    "simulation.visit",
+    "simulation.aim",
+)
 
 
 @dataclass(frozen=True)
@@ -72,7 +87,7 @@ class Commands:
             "rig.show": self._show_rig,
             "setup.new": self.setups.new_command,
             "setup.list": self.setups.list_command,
-            "session.start": self._if_kept("session", sessions.start_command),
+            "session.start": sessions.start_command,
             "session.stop": sessions.stop_command,
             "session.abort": sessions.abort_command,
             "session.shoot": sessions.shoot_command,
@@ -97,7 +112,7 @@ class Commands:
             "devices.configure": self._configure_devices,
             "store.prune": self._prune,
             "store.redecode": self._redecode,
-            "guide.start": self._if_kept("guide", self.guide.start_command),
+            "guide.start": self.guide.start_command,
             "guide.state": self.guide.state_command,
             "guide.done": self.guide.done_command,
             "guide.skip": self.guide.skip_command,
@@ -110,20 +125,16 @@ class Commands:
         return {name: partial(self._carry_out, name, handler) for name, handler in commands.items()}
 
     def _carry_out(self, name: str, handler: Handler, arguments: Mapping[str, Any]) -> Any:
-        given = checked_arguments(name, arguments)
+        given, health = checked_arguments(name, arguments), self.store_health()
+        is_kept = health.state not in ("missing", "replaced")
+        if not is_kept and COMMANDS[name].changes and name not in UNGUARDED:
+            raise CommandError(f"not carried out: {health.text}", REFUSED)
         with unwritable_errors(self.store.path):
-            return handler(given)
-
-    def _if_kept(self, what: str, handler: Handler) -> Handler:
-        """Wrap a handler: refuse its command if the open store's file is missing or replaced."""
-
-        def kept(arguments: Mapping[str, Any]) -> Any:
-            health = self.store_health()
-            if health.state in ("missing", "replaced"):
-                raise CommandError(f"the {what} is not started: {health.text}", REFUSED)
-            return handler(arguments)
-
-        return kept
+            answer = handler(given)
+        if not is_kept and name in ENDING:
+            lost = f"what is stored now, also this end of the session, may be lost when the daemon stops: {health.text}"
+            answer |= {"advice": [*answer.get("advice", ()), lost]}
+        return answer
 
     def _show_rig(self, _arguments: Mapping[str, Any]) -> dict[str, Any]:
         """Return the rig's name and the text of its rig file."""

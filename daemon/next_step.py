@@ -179,7 +179,7 @@ def _pressing(status: Mapping[str, Any], candidate: Mapping[str, Any] | None) ->
     if gap.get("failed") is not None:
         how = "`rigcal jobs list`, `rigcal session start`"
         yield f"job {gap['failed']['job']} failed: follow its error message, or hold another session", how
-    if candidate is not None and candidate["comparison"] is None:
+    if candidate is not None and candidate["comparison"] is None and not candidate.get("is_outdated"):
         how = "`rigcal session start --kind check --prism NAME`"
         yield "hold a check session to judge the new model", how
     verdict = gap.get("verdict")
@@ -193,6 +193,10 @@ def _to_improve(
     """Return the step that leads to a first or a better model, and the command for it."""
     if candidate is not None:
         refused = f"model {candidate['id']} would be refused: {candidate['refused_because']}"
+        if candidate.get("is_outdated"):
+            return f"{refused}; hold a calibration session, which yields a new model", _NEW_SESSION
+        if candidate["comparison"].get("is_stale"):
+            return refused, ""  # the reason says how it is compared again
         return f"{refused}; hold sessions with other prisms or poses, then another check session", ""
     if live is None:
         step = "hold a calibration session; a guided session covers all prisms and a check, and yields a first model"

@@ -55,7 +55,7 @@ class JobQueue:
             self.table.newest_sessions(),
             self.table.pending(),
             {kind: number for kind, number in covered.items() if number is not None},
-            has_model=self.table.has_done(JobKind.RESIDUAL),
+            has_model=self.table.has_done(JobKind.GAP),
             live_from=run.after_session if run else None,
             drifted=self._models.drifted(run) if run else None,
             stale_candidate=self._stale_candidate(run) if run else None,
@@ -77,8 +77,6 @@ class JobQueue:
         sessions = self.table.sessions_of(job.id, row["through_session_id"])
         training = tuple(s["id"] for s in sessions if s["kind"] != CHECK)
         checks = tuple(s["id"] for s in sessions if s["kind"] == CHECK)
-        if row["model_id"] is not None:
-            return self._comparison(job, config, self._models.get(row["model_id"]), checks)
         if job.kind is JobKind.GAP:
             # Triggered by a drifted check, the job searches the checks too. After a training session they are held out.
             if job.session_id in checks:
@@ -86,22 +84,34 @@ class JobQueue:
             return self._order(job, config, training, held_out_ids=checks)
         if job.kind is JobKind.DRIFT:
             return self._drift_order(job, config, [(s["number"], s["id"]) for s in sessions if s["kind"] == CHECK])
-        if row["depends_on"] is None:
-            newest = self.table.newest(JobKind.RESIDUAL, "done")
-            result = newest["result"] if newest else {}
-        else:
-            result = self.table.result(row["depends_on"])
+        model = self._model_of(row)
+        if model is None:
+            return self._order(job, config, ())
         if job.kind is JobKind.COMPARISON:
-            return self._comparison(job, config, self._models.at(result["model"]), checks)
-        train_ids = tuple(result.get("sessions", training))
+            return self._comparison(job, config, model, checks)
         return self._order(
             job,
             config,
-            tuple(name for name in checks if name not in train_ids) if job.kind is JobKind.REPORT else training,
-            model=result.get("model"),
-            model_sha256=result.get("manifest_sha256"),
-            train_ids=train_ids,
+            tuple(name for name in checks if name not in model.sessions) if job.kind is JobKind.REPORT else training,
+            model=str(model.path),
+            model_sha256=model.manifest_sha256,
+            train_ids=model.sessions,
         )
+
+    def _model_of(self, row: Mapping[str, Any]) -> ModelRow | None:
+        """Return the model that a job works on: the one it names, the one of the job it depends on, or the newest.
+
+        Args:
+            row: the job.
+
+        Returns:
+            None for a job that identifies a model or checks the live one for drift.
+        """
+        if row["model_id"] is not None:
+            return self._models.get(row["model_id"])
+        if row["depends_on"] is not None:
+            return self._models.at(self.table.result(row["depends_on"])["model"])
+        return None if row["kind"] in (JobKind.GAP, JobKind.DRIFT) else self._models.newest()
 
     def _comparison(self, job: JobFacts, config: Config, model: ModelRow, checks: tuple[str, ...]) -> Order:
         """Order a comparison of a model with the live one, on the check sessions that neither was trained on."""
@@ -168,7 +178,10 @@ class JobQueue:
                     made_by = job_id
 
     def begin(self, job: JobFacts, time_limit_s: float, host_boot: str | None = None) -> bool:
-        """Mark a queued job as running and clear what earlier runs left; return False if it is no longer queued.
+        """Mark a queued job as running and clear what earlier runs left; return False if it does not run.
+
+        It does not if it is no longer queued. It is cancelled if a session on which its model was trained is not used
+        any more, for example because an operator has rejected it while an earlier job of the chain ran.
 
         Args:
             job: the job.
@@ -176,7 +189,13 @@ class JobQueue:
             host_boot: boot id of the computer; None if unknown.
         """
         with self._store.transaction():
-            if self.table.get(job.id)["state"] != "queued":
+            row = self.table.get(job.id)
+            if row["state"] != "queued":
+                return False
+            if (model := self._model_of(row)) is not None and (unused := self._models.not_used(model.sessions)):
+                name, why = unused
+                gone = f"session {name}, on which its model was trained, is not used any more: {why}"
+                self.end(job.id, Outcome("cancelled", gone))
                 return False
             self.table.change(
                 job.id,
@@ -243,7 +262,8 @@ class JobQueue:
                 self._models.add(job_id, outcome.result)
             if outcome.result is not None and "comparison" in outcome.result:
                 self._models.note_comparison(outcome.result["model"], outcome.result["comparison"])
-            if outcome.result is not None and "drift" in outcome.result:
+            # After a decision on a check, a later job makes the sums anew; they depend on the order of the checks.
+            if outcome.result is not None and "drift" in outcome.result and not self.table.is_superseded(job_id):
                 note_drift(self._models, outcome.result["drift"])
             if outcome.state in {"failed", "cancelled"}:
                 for waiting in self.table.chain(job_id)[1:]:

@@ -257,16 +257,18 @@ def _compare(order: Order, progress: Progress) -> dict[str, Any]:
     progress(0.0, "comparing with the live model")
     candidate = read_model(Path(str(order.model)), order.model_sha256)
     live, note = None, ""
+    is_unreadable = False
     if order.live_model is not None:
         try:
             live = read_model(Path(order.live_model), order.live_sha256)
         except ModelError as error:
             # An unusable live model must not keep a good candidate from replacing it; the operator sees the reason.
-            note = f"the live model cannot be read ({error}); "
+            note, is_unreadable = f"the live model cannot be read ({error}); ", True
     if live is not None and (why := candidate.rig.misreading(live.rig)):
         live, note = None, f"the live model has a different rig file ({why}), so it does not fit these readings; "
     compared = compare_held_out(candidate, live, _observations(order, candidate.rig, order.session_ids)).as_dict()
-    return result | {"comparison": about | compared | {"sentence": f"{note}{compared['sentence']}"}}
+    told = {"sentence": f"{note}{compared['sentence']}", "live_was_unreadable": is_unreadable}
+    return result | {"comparison": about | compared | told}
 
 
 def _check_drift(order: Order, progress: Progress) -> dict[str, Any]:

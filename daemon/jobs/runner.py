@@ -146,7 +146,11 @@ class JobRunner(WorkerThread):
             elif self._queue.table.offer_again(item.job_id):
                 log.info("job %d is queued again after an interruption", item.job_id)
         next_one = next_job(self._queue.state() if due else state)
-        if next_one is None or not self._queue.begin(next_one, self._settings.time_limit_s, self._host_boot):
+        if next_one is None:
+            return False
+        if not self._queue.begin(next_one, self._settings.time_limit_s, self._host_boot):
+            row = self._queue.table.get(next_one.id)
+            _log_end(next_one, Outcome(row["state"], row["error"]))
             return False
         self._perform(next_one)
         return True
@@ -174,9 +178,7 @@ class JobRunner(WorkerThread):
         if is_cut_off:  # the process found no store or a different one; the job waits until the daemon's file is back
             outcome = Outcome("interrupted", outcome.error)
         outcome = self._queue.end(job.id, outcome, is_attempt=not is_cut_off)
-        level = logging.INFO if outcome.state == "done" else logging.WARNING
-        why = f": {outcome.error}" if outcome.error else ""
-        log.log(level, "job %d (%s) is %s%s", job.id, job.kind, outcome.state, why)
+        _log_end(job, outcome)
 
     def _is_store_gone(self) -> bool:
         """Return True if the file at the store's path is missing or not the one that was opened."""
@@ -203,3 +205,9 @@ class JobRunner(WorkerThread):
                 self._queue.note_process(job_id, message.pid)
             elif message is not None:
                 self._queue.note_progress(job_id, message)
+
+
+def _log_end(job: JobFacts, outcome: Outcome) -> None:
+    level = logging.INFO if outcome.state == "done" else logging.WARNING
+    why = f": {outcome.error}" if outcome.error else ""
+    log.log(level, "job %d (%s) is %s%s", job.id, job.kind, outcome.state, why)

@@ -1,6 +1,7 @@
 """Drift of the live model: two CUSUM statistics of its errors on check sessions show whether the machine has changed.
 
-The sums (`calibration.numerics.statistics`) restart whenever a model goes live, also by a rollback.
+The sums (`calibration.numerics.statistics`) restart whenever a model goes live, also by a rollback. When an operator
+accepts or rejects a check session, the sums from this session on are deleted, and a drift job makes them anew.
 """
 
 from __future__ import annotations
@@ -78,13 +79,14 @@ def gap_status(jobs: JobTable, models: ModelTable) -> dict[str, Any]:
     """Return the gap between simulation and machine, as shown in `status`.
 
     Returns:
-        `verdict`: result of the newest gap job that is done, or None. `failed`: `job`, `session` and `error` of a later
-        gap job that failed, or None. `drift`: as from `drift_status`.
+        `verdict`: result of the newest gap job that is done, or None; also None if one of its sessions is not used any
+        more. `failed`: `job`, `session` and `error` of a later gap job that failed, or None. `drift`: as from
+        `drift_status`.
     """
     done, failed = (jobs.newest(JobKind.GAP, state) for state in ("done", "failed"))
     is_later = failed is not None and (done is None or failed["id"] > done["id"])
     return {
-        "verdict": _verdict(done),
+        "verdict": _verdict(done, models),
         "failed": {"job": failed["id"], "session": failed["session_id"], "error": failed["error"]}
         if failed and is_later
         else None,
@@ -92,10 +94,12 @@ def gap_status(jobs: JobTable, models: ModelTable) -> dict[str, Any]:
     }
 
 
-def _verdict(job: Mapping[str, Any] | None) -> dict[str, Any] | None:
+def _verdict(job: Mapping[str, Any] | None, models: ModelTable) -> dict[str, Any] | None:
     if job is None or "gap" not in job["result"]:  # identifications made before the gap workflow existed
         return None
     result = job["result"]
+    if models.not_used(result.get("sessions", ())) is not None:
+        return None
     return {
         "job": job["id"],
         "session": job["session_id"],

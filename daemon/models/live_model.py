@@ -36,12 +36,14 @@ class Loaded:
         model: to predict with.
         jumped: joints whose readings jumped since the model was trained, so that their zeros may differ from it.
         time_axis: the axis of `time_s` in its training data, as of the time of loading.
+        sessions: on which it was trained.
     """
 
     id: int
     model: CalibratedModel
     jumped: tuple[str, ...]
     time_axis: TimeAxis
+    sessions: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -69,6 +71,7 @@ class LiveModelHealth:
         defect: why the model cannot be used; "" if it can, or if that is unknown.
         hindrance: what prevents the computer from loading it; "" if nothing does.
         drifted_with: the check session that showed drift; None if there is no drift.
+        rejected: a session on which it was trained and which an operator has rejected; None without one.
     """
 
     id: int
@@ -76,6 +79,7 @@ class LiveModelHealth:
     defect: str = ""
     hindrance: str = ""
     drifted_with: str | None = None
+    rejected: str | None = None
 
 
 class LiveModel(WorkerThread):
@@ -113,7 +117,8 @@ class LiveModel(WorkerThread):
         live, drifted = self.now(), self._table.drifted(run)
         drifted_with = None if drifted is None else drifted[1]
         if isinstance(live, Loaded):
-            return LiveModelHealth(run.model_id, live.jumped, drifted_with=drifted_with)
+            rejected = self._table.rejected(live.sessions)
+            return LiveModelHealth(run.model_id, live.jumped, drifted_with=drifted_with, rejected=rejected)
         reason = live.reason if live.is_defect else ""
         defect, hindrance = ("", reason) if live.is_hindered else (reason, "")
         return LiveModelHealth(run.model_id, (), defect, hindrance, drifted_with)
@@ -160,7 +165,7 @@ class LiveModel(WorkerThread):
             if row is None:
                 return Missing(NO_MODEL)
             jumped = tuple(name for name in self._table.jumped(row) if name in self._rig.joint_names)
-            loaded = Loaded(row.id, self.load(row), jumped, self._table.time_axis())
+            loaded = Loaded(row.id, self.load(row), jumped, self._table.time_axis(), row.sessions)
         except Exception as error:  # noqa: BLE001 - logged, and shown as the state
             if self._stopping.is_set():
                 return Missing(LOADING)  # store and processes are being stopped: not a defect of the model

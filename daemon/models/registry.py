@@ -53,15 +53,15 @@ class ModelRegistry:
         self._table, self._rig, self._live = table, rig_name, live
         self._compare, self._comparison_job, self._comparison_after = compare, comparison_job, comparison_after
         self._zeros_checked = zeros_checked
-        # The candidate that was last loaded for `status`, the state of its files then, and why it cannot go live.
-        self._loaded: tuple[tuple[int, _Files], str | None] | None = None
+        # Model -> the state of its files when it was last loaded for `status`, and why it cannot go live.
+        self._loaded: dict[int, tuple[_Files, str | None]] = {}
 
     # ---- commands of the operator ------------------------------------------------------------------------------------
 
     def list_command(self, _arguments: Mapping[str, Any]) -> list[dict[str, Any]]:
         """Return all models, oldest first."""
         live = self._table.live()
-        return [_brief(model, live) for model in self._table.all()]
+        return [self._brief(model, live) for model in self._table.all()]
 
     def show_command(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
         """Return a model, by default the live one, with its comparison and all changes of its state."""
@@ -146,17 +146,22 @@ class ModelRegistry:
     def status(self) -> dict[str, Any]:
         """Return the live model and the newest candidate, for `status`."""
         live, waiting = self._table.live(), self._table.waiting()
-        return {"live": live and _brief(live, live), "candidate": waiting and self._candidate(waiting, live)}
+        return {"live": live and self._brief(live, live), "candidate": waiting and self._candidate(waiting, live)}
 
     def _candidate(self, model: ModelRow, live: ModelRow | None) -> dict[str, Any]:
-        """Return a candidate, with whether `accept_command` would accept it now and, if not, the reason."""
+        """Return a candidate, with whether `accept_command` would accept it now and, if not, the reason.
+
+        Returns:
+            Also `is_outdated`: whether it was trained on a session that is not used any more, so no check can help it.
+        """
         refusal: str | None = None
         try:
             self._reason_to_accept(model, live)
             self._require_loads(model)
         except CommandError as error:
             refusal = str(error).removeprefix(_CANNOT.format(model.id))  # `status` names the model already
-        return _brief(model, live) | {"is_acceptable": refusal is None, "refused_because": refusal}
+        told = {"is_acceptable": refusal is None, "refused_because": refusal}
+        return self._brief(model, live) | told | {"is_outdated": self._table.not_used(model.sessions) is not None}
 
     # ---- parts -------------------------------------------------------------------------------------------------------
 
@@ -178,7 +183,8 @@ class ModelRegistry:
         self._load(model)
         if not self._table.go_live(model, live, reason, operator=operator, **caller_columns()):
             raise CommandError(
-                "the models were changed in the meantime by another command or comparison; check `rigcal model list`",
+                "models or sessions were changed in the meantime by another command or by a comparison; check "
+                "`rigcal model list`",
                 REFUSED,
             )
         log.warning("model %d was made live by %s: %s", model.id, operator or "an unnamed operator", reason)
@@ -192,9 +198,9 @@ class ModelRegistry:
 
     def _require_loads(self, model: ModelRow) -> None:
         """Do as `_load`, which takes a second, but only once for the same state of the model's files."""
-        files = model.id, _files(model.path)
-        loaded = self._loaded
-        if loaded is None or loaded[0] != files:
+        files = _files(model.path)
+        seen, refusal = self._loaded.get(model.id, (None, None))
+        if seen != files:
             refusal = None
             try:
                 self._load(model)
@@ -202,39 +208,84 @@ class ModelRegistry:
                 if not isinstance(error.__cause__, ModelError | UnsafeError):
                     raise  # the computer's fault, as when memory is short: the next time it may load
                 refusal = str(error)
-            self._loaded = loaded = files, refusal
-        if loaded[1] is not None:
-            raise CommandError(loaded[1], REFUSED)
+            self._loaded[model.id] = files, refusal
+        if refusal is not None:
+            raise CommandError(refusal, REFUSED)
 
     def _reason_to_accept(self, model: ModelRow, live: ModelRow | None) -> str:
         """Return the reason why a candidate may go live; raise CommandError (REFUSED) if it may not."""
+        if (unused := self._table.not_used(model.sessions)) is not None:
+            raise CommandError(f"{_CANNOT.format(model.id)}it was trained on {_not_used(*unused)}", REFUSED)
         compared = model.comparison
-        is_stale = compared is not None and _is_stale(compared, live)
+        stale = None if compared is None else self._why_stale(compared, live)
         again = f"; `rigcal model compare {model.id}` compares it again"
-        if (compared is None or is_stale) and (job := self._comparison_job(model)) is not None:
+        if (compared is None or stale) and (job := self._comparison_job(model)) is not None:
             again = f"; wait for job {job}, which will compare it"
         elif compared is None and (later := self._comparison_after(model)) is not None:
             job, maker = later
             again = f"; wait for job {job}, which will compare the model that job {maker} makes of the same sessions"
-        elif compared is None:
+        elif compared is None or self._why_unchecked(compared):
             again = f": hold a check session (`rigcal session start --kind check`){again}"
         if compared is None:
             raise CommandError(f"model {model.id} was not compared on held-out data yet{again}", REFUSED)
-        if is_stale:
-            now = f"model {live.id} is live now" if live else "none is live now"
-            then = "no model was live" if compared["live"] is None else f"model {compared['live']} was live"
-            raise CommandError(f"model {model.id} was compared when {then}, but {now}{again}", REFUSED)
+        if stale:
+            raise CommandError(f"model {model.id} was compared {stale}{again}", REFUSED)
         if not compared["is_better"]:
             raise CommandError(f"{_CANNOT.format(model.id)}{compared['sentence']}", REFUSED)
         return str(compared["sentence"])
+
+    def _why_stale(self, compared: Mapping[str, Any], live: ModelRow | None) -> str | None:
+        """Return with what or on what a model was compared, a clause, if that does not count any more; else None."""
+        if compared["live"] != (live and live.id):
+            now = f"model {live.id} is live now" if live else "none is live now"
+            then = "no model was live" if compared["live"] is None else f"model {compared['live']} was live"
+            return f"when {then}, but {now}"
+        if live is not None and compared.get("live_was_unreadable") and self._loads(live):
+            return f"when the files of model {live.id} could not be read, but now they can"
+        return self._why_unchecked(compared)
+
+    def _why_unchecked(self, compared: Mapping[str, Any]) -> str | None:
+        """Return on which check session a model was compared, a clause, if none or one that is not used; else None."""
+        checks = compared.get("sessions")
+        if checks is None:  # not noted
+            return None
+        if not checks:
+            return "on no check session, as none holds fixes that neither model was trained on"
+        unused = self._table.not_used(checks)
+        return None if unused is None else f"on {_not_used(*unused)}"
+
+    def _loads(self, model: ModelRow) -> bool:
+        try:
+            self._require_loads(model)
+        except CommandError:
+            return False
+        return True
+
+    def _brief(self, model: ModelRow, live: ModelRow | None) -> dict[str, Any]:
+        compared = model.comparison
+        stale = self._why_stale(compared, live) if compared and model.state == "candidate" else None
+        return {
+            "id": model.id,
+            "rig": model.rig,
+            "state": model.state,
+            "stage": model.stage,
+            "created_utc_ns": model.created_utc_ns,
+            "path": str(model.path),
+            "sessions": len(model.sessions),
+            "comparison": compared
+            and {
+                **{key: compared[key] for key in ("live", "is_better", "sentence")},
+                "is_stale": stale is not None,
+                "stale_because": stale,
+            },
+        }
 
     def _changed(self, model: ModelRow, live: ModelRow | None) -> dict[str, Any]:
         return {"live": model.id, "retired": live and live.id, "path": str(model.path)}
 
 
-def _is_stale(compared: Mapping[str, Any], live: ModelRow | None) -> bool:
-    """Return True if a comparison was with a model that is not the present live model."""
-    return bool(compared["live"] != (live and live.id))
+def _not_used(session_id: str, why: str) -> str:
+    return f"session {session_id}, which calibration does not use any more ({why})"
 
 
 def _files(directory: Path) -> _Files:
@@ -243,22 +294,3 @@ def _files(directory: Path) -> _Files:
         return tuple(sorted((e.name, e.stat().st_size, e.stat().st_mtime_ns) for e in os.scandir(directory)))
     except OSError:
         return ()
-
-
-def _brief(model: ModelRow, live: ModelRow | None) -> dict[str, Any]:
-    compared = model.comparison
-    waits = model.state == "candidate"
-    return {
-        "id": model.id,
-        "rig": model.rig,
-        "state": model.state,
-        "stage": model.stage,
-        "created_utc_ns": model.created_utc_ns,
-        "path": str(model.path),
-        "sessions": len(model.sessions),
-        "comparison": compared
-        and {
-            **{key: compared[key] for key in ("live", "is_better", "sentence")},
-            "is_stale": waits and _is_stale(compared, live),
-        },
-    }

@@ -25,6 +25,7 @@ from daemon.rig_files import misreading
 from daemon.sessions.open_session import CONSTANT_TOLERANCE_MM, OpenSession
 from daemon.store.connection import rig_sha256
 from daemon.store.queries.jobs import JobTable
+from daemon.store.queries.models import ModelTable
 from daemon.store.queries.observations import first_constants_mm, stations_of
 from daemon.store.queries.poses import has_poses_before_enclosed, is_enclosed
 from daemon.store.queries.sessions import (
@@ -75,7 +76,7 @@ class SessionLifecycle:
         self._store, self._rig, self._clock, self._tolerance_mm = store, rig, clock, tolerance_mm
         self._clock_state = clock_state
         self.table, self._setups = SessionTable(store, rig.name), SetupTable(store, rig.name)
-        self._jobs = JobTable(store, rig.name)
+        self._jobs, self._models = JobTable(store, rig.name), ModelTable(store, rig.name, clock)
 
     def unfinished(self, rig_text: str, stations: Collection[str]) -> tuple[OpenSession | None, list[OpenSession]]:
         """Return the rig's open session, and ended sessions whose last captures are not yet decoded.
@@ -256,6 +257,7 @@ class SessionLifecycle:
             if despite.startswith(OTHER_RIG_FILE):
                 raise CommandError(f"session {session_id!r}: {despite}; {HOW_TO_READ_AGAIN}", REFUSED)
             self._decide(session_id, operator, "accepted", instead_of="rejected")
+            self._models.forget_drift(session_id)
             told = {"accepted_despite": despite, "accepted_after_job": self._jobs.newest_id()}
             self.table.change(session_id, excluded=None, rejected_reason=None, **told)
         return despite
@@ -263,7 +265,7 @@ class SessionLifecycle:
     def reject(self, session_id: str, operator: str, reason: str) -> str:
         """Keep calibration from using a closed session from now on, until an operator accepts it.
 
-        Training that has used the session is repeated without it.
+        Training that has used the session is repeated without it, and so are the sums of drift.
 
         Args:
             session_id: the session.
@@ -288,7 +290,8 @@ class SessionLifecycle:
                 raise CommandError(f"session {session_id!r} is already rejected")
             self._decide(session_id, operator, "rejected", instead_of="accepted")
             self.table.change(session_id, rejected_reason=reason, accepted_despite=None)
-            if excluded is None:
+            has_drift = self._models.forget_drift(session_id)
+            if excluded is None or has_drift:
                 self.table.change(session_id, accepted_after_job=self._jobs.newest_id())
             excluded = self._why_not_used(session_id)
             self.table.change(session_id, excluded=excluded)

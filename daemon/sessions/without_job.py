@@ -36,6 +36,6 @@ def _reasons(session: Mapping[str, Any], jobs: JobTable, are_jobs_enabled: bool)
         yield f"job {other['id']} of session {other['session_id']} includes this session"
     if not are_jobs_enabled:
         yield "jobs are disabled: set `[jobs] enabled = true` in the configuration and restart rigcal"
-    if is_check and not jobs.has_done(JobKind.RESIDUAL):
+    if is_check and not jobs.has_done(JobKind.GAP):
         yield "there is no model yet to compare the session with; the report of the first model will use it"
     yield "its jobs are queued within seconds, as soon as no session is open"

@@ -89,6 +89,19 @@ def test_a_candidate_that_would_be_refused_says_why() -> None:
     assert "no gain beyond chance" in found["step"]
 
 
+def test_a_candidate_that_no_check_could_judge_needs_a_check_and_nothing_else() -> None:
+    refused = "it was compared on no check session: hold a check session"
+    candidate = {"id": 5, "is_acceptable": False, "refused_because": refused, "comparison": {"is_stale": True}}
+    step = next_line(status(models={"live": LIVE, "candidate": candidate}))
+    assert step == f"model 5 would be refused: {refused}"
+
+
+def test_a_candidate_from_a_rejected_session_needs_a_new_session_and_no_check() -> None:
+    candidate = {"id": 5, "is_acceptable": False, "refused_because": "b was rejected", "comparison": None}
+    step = next_line(status(models={"live": LIVE, "candidate": candidate | {"is_outdated": True}}))
+    assert step.startswith("model 5 would be refused: b was rejected; hold a calibration session, which yields a new")
+
+
 def test_a_critical_alarm_colours_whatever_is_going_on() -> None:
     alarms = {"active": [{"severity": "critical"}]}
     assert next_for_page(status(alarms=alarms))["tone"] == "critical"

@@ -101,6 +101,23 @@ def model_drifted(evidence: Evidence) -> Iterator[Finding]:
 
 
 @rule(
+    "warning",
+    "Accept a model that was trained without the session, once there is one, or return to an earlier model with "
+    "`rigcal model rollback NUMBER`; `rigcal model list` shows all.",
+)
+def model_of_rejected_session(evidence: Evidence) -> Iterator[Finding]:
+    """The live model was trained on a session that an operator has rejected since.
+
+    Cleared when another model goes live, or when the session is accepted again.
+    """
+    if evidence.model is not None and evidence.model.rejected is not None:
+        yield (
+            f"model {evidence.model.id}",
+            f"the live model was trained on session {evidence.model.rejected}, which has been rejected",
+        )
+
+
+@rule(
     "critical",
     "`rigcal model list` shows the other models: one that was live before goes live again with "
     "`rigcal model rollback NUMBER`, a candidate with `rigcal model compare NUMBER` and then "

@@ -213,9 +213,8 @@ def _show_list(models: Sequence[Mapping[str, Any]]) -> None:
     for model in models:
         compared = model["comparison"]
         verdict = compared["sentence"] if compared else "not compared yet"
-        if compared and compared["is_stale"]:
-            then = "when none was live" if compared["live"] is None else f"with model {compared['live']}, then live"
-            verdict = f"out of date, compared {then}: {verdict}"
+        if compared and (stale := compared.get("stale_because")):
+            verdict = f"out of date, compared {stale}: {verdict}"
         made = utc(model["created_utc_ns"])
         rows.append([str(model["id"]), model["state"], model["stage"], made, str(model["sessions"]), verdict])
     echo_table(("model", "state", "stage", "made", "sessions", "comparison"), rows)

@@ -58,19 +58,14 @@ def session_stop(**where: Any) -> Any:
 
     Its jobs then run automatically; `rigcal jobs list` shows them.
     """
-
-    def show(closed: Mapping[str, Any]) -> None:
-        show_session(closed)
-        _advise(closed)
-
-    return ask(where, "session.stop", show)
+    return ask(where, "session.stop", _show_ended)
 
 
 @session.command(cls=Command, name="abort")
 @client_options
 def session_abort(**where: Any) -> Any:
     """Close the open session and mark it as unusable."""
-    return ask(where, "session.abort", show_session)
+    return ask(where, "session.abort", _show_ended)
 
 
 @session.command(cls=Command, name="accept")
@@ -280,8 +275,13 @@ def _guide_arguments(given: Mapping[str, Any]) -> dict[str, Any]:
     return {key: value for key, value in about.items() if value is not None}
 
 
+def _show_ended(ended: Mapping[str, Any]) -> None:
+    show_session(ended)
+    _advise(ended)
+
+
 def _advise(result: Mapping[str, Any]) -> None:
-    for sentence in result["advice"]:
+    for sentence in result.get("advice", ()):
         echo(f"  note: {sentence}")
 
 

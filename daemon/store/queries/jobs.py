@@ -184,6 +184,12 @@ class JobTable:
         sql = "SELECT 1 FROM jobs WHERE kind = 'comparison' AND model_id = ? AND live_since = ? LIMIT 1"
         return bool(self._store.rows(sql, (model_id, live_since)))
 
+    def is_superseded(self, job_id: int) -> bool:
+        """Return True if an operator has accepted a check session, or rejected a used one, since a job was queued."""
+        sql = f"""SELECT 1 FROM calibration_sessions
+            WHERE rig = ? AND accepted_after_job IS NOT NULL AND accepted_after_job >= ? AND kind = '{CHECK}' LIMIT 1"""
+        return bool(self._store.rows(sql, (self._rig, job_id)))
+
     def comparison_of(self, model: ModelRow) -> int | None:
         """Return the unfinished job that compares a model on held-out sessions; None if there is none.
 

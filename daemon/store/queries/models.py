@@ -1,14 +1,14 @@
 """The tables of models: every model and its state, all changes of states, and results of live models on check sessions.
 
 A model is created as a candidate, goes live when an operator accepts it, and is retired when another model replaces it;
-it can be made live again. Each rig has one live model. Each change adds a row to `model_states`. No row of these tables
-is ever deleted, and neither are the models' directories.
+it can be made live again. Each rig has one live model. Each change adds a row to `model_states`. No model and no change
+is ever deleted, and neither are the models' directories. Results on check sessions are deleted to be made anew.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -19,6 +19,7 @@ from daemon.store.errors import NotInStoreError
 from daemon.store.queries.sessions import SessionTable
 from daemon.store.queries.time_axis import TimeAxis, time_axis
 from daemon.store.queries.zeros import lost_zeros
+from daemon.store.rows import marks
 from drivers.clock import Clock
 
 _MODELS = """SELECT model.id, model.rig, model.path, model.manifest_sha256, model.stage, model.state,
@@ -31,11 +32,11 @@ _LIVE_RUN = """SELECT state.id AS since, model.id AS model_id, coalesce(state.af
     ORDER BY state.id DESC LIMIT 1"""
 _DRIFTED = """SELECT session.rowid AS number, session.id FROM drift_checks AS drift
     CROSS JOIN calibration_sessions AS session ON session.id = drift.session_id
-    WHERE drift.live_since = ? AND drift.alarm = 'worse' AND session.rejected_utc_ns IS NULL
-    ORDER BY drift.id LIMIT 1"""
-_DRIFT_CHECKS = """SELECT drift.session_id, standstills, ratio, reason, upper, lower, alarm FROM drift_checks AS drift
-    CROSS JOIN calibration_sessions AS session ON session.id = drift.session_id
-    WHERE live_since = ? AND session.rejected_utc_ns IS NULL ORDER BY drift.id"""
+    WHERE drift.live_since = ? AND drift.alarm = 'worse' ORDER BY drift.id LIMIT 1"""
+_DRIFT_CHECKS = """SELECT session_id, standstills, ratio, reason, upper, lower, alarm FROM drift_checks
+    WHERE live_since = ? ORDER BY id"""
+_FORGET_DRIFT = """DELETE FROM drift_checks WHERE live_since = ? AND session_id IN (SELECT id FROM calibration_sessions
+    WHERE rowid >= (SELECT rowid FROM calibration_sessions WHERE id = ? AND kind = 'check'))"""
 
 
 @dataclass(frozen=True)
@@ -138,10 +139,31 @@ class ModelTable:
         found = self._store.rows(f"{_MODELS} WHERE model.rig = ? AND model.state = 'live'", (self._rig,))
         return _row(found[0]) if found else None
 
+    def newest(self) -> ModelRow | None:
+        """Return the rig's newest model; None before the first."""
+        found = self._store.rows(f"{_MODELS} WHERE model.rig = ? ORDER BY model.id DESC LIMIT 1", (self._rig,))
+        return _row(found[0]) if found else None
+
     def waiting(self) -> ModelRow | None:
         """Return the rig's newest model if it is a candidate, otherwise None."""
-        found = self._store.rows(f"{_MODELS} WHERE model.rig = ? ORDER BY model.id DESC LIMIT 1", (self._rig,))
-        return _row(found[0]) if found and found[0]["state"] == "candidate" else None
+        newest = self.newest()
+        return newest if newest is not None and newest.state == "candidate" else None
+
+    def not_used(self, session_ids: Collection[str]) -> tuple[str, str] | None:
+        """Return the first of some sessions that calibration does not use any more, and why, a clause; None if all are.
+
+        Args:
+            session_ids: closed sessions; unknown ones are ignored.
+        """
+        sql = f"""SELECT id, excluded FROM calibration_sessions
+            WHERE id IN ({marks(session_ids)}) AND excluded IS NOT NULL ORDER BY rowid LIMIT 1"""
+        return next(((row["id"], row["excluded"]) for row in self._store.rows(sql, (*session_ids,))), None)
+
+    def rejected(self, session_ids: Collection[str]) -> str | None:
+        """Return the first of some sessions that an operator has rejected; None if none was."""
+        sql = f"""SELECT id FROM calibration_sessions
+            WHERE id IN ({marks(session_ids)}) AND rejected_utc_ns IS NOT NULL ORDER BY rowid LIMIT 1"""
+        return next((str(row["id"]) for row in self._store.rows(sql, (*session_ids,))), None)
 
     def predecessor(self, model: ModelRow) -> int | None:
         """Return the number of the model that was live when this one was accepted; None for the first model."""
@@ -230,11 +252,13 @@ class ModelTable:
 
         Returns:
             False, with nothing changed, if a different model is live by now, or the model was compared again or has
-            changed its state since.
+            changed its state since, or a session on which a candidate was trained is not used any more.
         """
         with self._store.transaction():
             now_live = self.live()
             if self.get(model.id) != model or (now_live and now_live.id) != (replaced and replaced.id):
+                return False
+            if model.state == "candidate" and self.not_used(model.sessions) is not None:
                 return False
             if replaced is not None:
                 self._store.update("models", {"id": replaced.id}, {"state": "retired"})
@@ -284,6 +308,21 @@ class ModelTable:
     def _note_state(self, model_id: int, state: str, reason: str, **columns: object) -> None:
         row = {"model_id": model_id, "state": state, "reason": reason, **columns}
         self._store.insert("model_states", row | self._store.instant(self._clock.now()))
+
+    def forget_drift(self, session_id: str) -> bool:
+        """Delete what a check session and all later ones showed of the live model, so that it is made anew, in order.
+
+        Args:
+            session_id: the session; of one that is no check, nothing is deleted.
+
+        Returns:
+            Whether anything was deleted.
+        """
+        run = self.live_run()
+        if run is None:
+            return False
+        with self._store.transaction() as db:
+            return db.execute(_FORGET_DRIFT, [run.since, session_id]).rowcount > 0
 
     def add_drift_check(self, **columns: object) -> None:
         """Add the comparison of a check session with a live model."""

@@ -175,8 +175,7 @@ class SessionTable:
         Raises:
             NotInStoreError: there is no such session.
         """
-        with self._store.reader() as reader:
-            return _summary(reader, session_id, count)
+        return _summary(self._store, session_id, count)
 
     def all(self) -> list[dict[str, Any]]:
         """Return all summaries, oldest first, read on a separate connection so that the writing one does not wait."""

@@ -17,13 +17,14 @@ _MISCLOSURES = """SELECT s.name, s.phase, s.x_mm - p.x_mm AS x, s.y_mm - p.y_mm 
     FROM control_shots AS s JOIN control_points AS p ON p.setup_id = s.setup_id AND p.name = s.name
     WHERE s.setup_id = ? AND s.session_id IN ({}) ORDER BY s.id"""
 # A set-up is named by its description, a guide or a session. An open guide or session takes precedence over later ones.
+# Closed sessions of any rig count, because the station stays where it stands when the rig gets another name.
 _CURRENT = """WITH named AS (
         SELECT * FROM (SELECT id AS setup_id, 0 AS is_open, created_boot_id AS boot, created_monotonic_ns AS at
             FROM station_setups ORDER BY rowid DESC LIMIT 1)
         UNION ALL SELECT * FROM (SELECT setup_id, state = 'open', started_boot_id, started_monotonic_ns
             FROM guides WHERE rig = ?1 ORDER BY id DESC LIMIT 1)
-        UNION ALL SELECT * FROM (SELECT setup_id, state = 'open', started_boot_id, started_monotonic_ns
-            FROM calibration_sessions WHERE rig = ?1 ORDER BY rowid DESC LIMIT 1))
+        UNION ALL SELECT * FROM (SELECT setup_id, state = 'open' AND rig = ?1, started_boot_id, started_monotonic_ns
+            FROM calibration_sessions ORDER BY rowid DESC LIMIT 1))
     SELECT id, state FROM named JOIN station_setups ON id = setup_id
     ORDER BY is_open DESC, boot DESC, at DESC LIMIT 1"""
 # The newest shot of each control point of a set-up: with max(), SQLite takes the other columns from its row.

@@ -12,10 +12,12 @@ from daemon.alarms.evidence import Gatherer
 from daemon.jobs.order import Outcome
 from daemon.models.drift import note_drift
 from daemon.service import is_store_new
+from daemon.sessions.lifecycle import SessionLifecycle
 from daemon.store.queries.jobs import FailedJob, JobTable
 from daemon.store.queries.sessions import SessionTable
 from daemon.store.queries.setups import SetupRow, SetupTable
 from drivers.readings import DeviceEvent, EventKind
+from tests.daemon.support.jobs import SOURCE
 from tests.daemon.support.models import ModelRig, wait
 
 
@@ -111,6 +113,13 @@ def test_the_live_model_is_told_with_jumps_defects_and_drift(rig: ModelRig, gath
     found = gather().model
     assert found is not None
     assert found.drifted_with == "c"
+    assert found.rejected is None
+    sessions = SessionLifecycle(rig.store, SOURCE.rig, rig.clock, 10.0)
+    sessions.reject("a", "Ada", "measured on w")
+    found = gather().model
+    assert found is not None
+    assert found.rejected == "a"
+    sessions.accept("a", "Ada")
     file = rig.models.get(number).path / "model.json"
     file.write_bytes(file.read_bytes()[:-10])
     rig.live.changed()

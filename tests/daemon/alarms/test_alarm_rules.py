@@ -381,6 +381,9 @@ CASES: dict[str, list[tuple[Evidence, list[str], Evidence]]] = {
     "model_drifted": [
         (known(model=LiveModelHealth(2, drifted_with="s009-r")), ["model 2"], known(model=LiveModelHealth(3))),
     ],
+    "model_of_rejected_session": [
+        (known(model=LiveModelHealth(2, rejected="s001-r")), ["model 2"], known(model=LiveModelHealth(2))),
+    ],
     "model_unusable": [
         (known(model=LiveModelHealth(2, defect="damaged")), ["model 2"], known(model=LiveModelHealth(2)))
     ],

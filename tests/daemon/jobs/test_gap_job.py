@@ -10,8 +10,9 @@ import pytest
 from calibration.numerics.statistics import CLIP
 from daemon.cli.lines.state import gap_lines
 from daemon.jobs.job_queue import JobQueue
-from daemon.jobs.order import Order
+from daemon.jobs.order import Order, Outcome
 from daemon.jobs.process import perform
+from daemon.jobs.scheduler import CHAIN, DueChain
 from daemon.models.drift import drift_status, gap_status, note_drift
 from daemon.models.model_files import read_model
 from daemon.sessions.lifecycle import SessionLifecycle
@@ -45,6 +46,14 @@ def check(rig: JobRig, name: str, *, jobs: int) -> None:
     rig.session(name, kind="check")
     rig.clock.advance(3.0)
     rig.wait(lambda: rig.states() == ["done"] * jobs, f"{jobs} jobs")
+
+
+def lifecycle(rig: JobRig) -> SessionLifecycle:
+    return SessionLifecycle(rig.store, SOURCE.rig, rig.clock, 10.0)
+
+
+def rejected(rig: JobRig, name: str) -> None:
+    lifecycle(rig).reject(name, "Ada", "measured on w")
 
 
 def kinds(rig: JobRig) -> list[str]:
@@ -113,8 +122,101 @@ def test_a_rejected_check_shows_no_drift(rig: JobRig) -> None:
     before = drift(rig)
     check(rig, "c2", jobs=14)
     assert drift(rig)["drifted_with"] == "c2"
-    rig.store.update("calibration_sessions", {"id": "c2"}, {"excluded": "it was rejected", "rejected_utc_ns": 1})
+    rejected(rig, "c2")
     assert drift(rig) == before
+
+
+def test_the_sums_are_made_anew_without_a_check_that_is_rejected_and_with_it_once_it_is_accepted(rig: JobRig) -> None:
+    with_live_model(rig)
+    rig.plan(drift=f"scores {CLIP} {CLIP}")
+    check(rig, "c1", jobs=7)
+    rig.plan(drift="scores 1.5 1.5")
+    check(rig, "c2", jobs=10)
+    both = drift(rig)
+    rejected(rig, "c1")
+    assert drift(rig)["checks"] == 0
+    rig.clock.advance(3600.0)
+    rig.wait(lambda: drift(rig)["checks"] == 1, "the drift job")
+    alone = drift(rig)
+    assert (alone["newest"], alone["upper"] < both["upper"], alone["alarm"]) == ("c2", True, "none")
+    lifecycle(rig).accept("c1", "Ada")
+    rig.clock.advance(3600.0)
+    rig.wait(lambda: drift(rig)["checks"] == 2, "the drift job")
+    assert [row["session_id"] for row in rig.store.rows("SELECT session_id FROM drift_checks ORDER BY id")] == [
+        "c1",
+        "c2",
+    ]
+
+
+@pytest.mark.parametrize("others", [0, 1])
+def test_without_a_later_check_nothing_is_left_of_a_rejected_one_and_no_job_is_repeated_for_ever(
+    rig: JobRig, others: int
+) -> None:
+    with_live_model(rig)
+    names = [f"c{n}" for n in range(others + 1)]
+    for n, name in enumerate(names):
+        check(rig, name, jobs=7 + 3 * n)
+    rejected(rig, names[-1])
+    rig.clock.advance(3600.0)
+    jobs = 11 + 4 * others  # the whole chain again, and a check of drift if a check is left
+    rig.wait(lambda: rig.states() == ["done"] * jobs, f"{jobs} jobs")
+    rig.look_on()
+    assert (rig.states(), drift(rig)["checks"]) == (["done"] * jobs, others)
+
+
+def test_what_a_check_of_drift_found_before_a_check_session_was_rejected_does_not_count(rig: JobRig) -> None:
+    with_live_model(rig)
+    rig.plan(drift="hang")
+    rig.session("c1", kind="check")
+    rig.clock.advance(3.0)
+    rig.wait(lambda: rig.states() == [*["done"] * 6, "running"], "the check of drift")
+    queue = JobQueue(rig.store, "swdt82", rig.clock)
+    run = model_table(rig).live_run()
+    assert run is not None
+    rejected(rig, "c1")
+    found = {"session": "c1", "scores": [CLIP] * 3, "fixes": 3, "ratio": 9.0, "reason": ""}
+    queue.end(7, Outcome("done", result={"drift": {"live_since": run.since, "checks": [found]}}))
+    assert (drift(rig)["checks"], drift(rig)["alarm"]) == (0, "none")
+
+
+def test_a_chain_whose_session_is_rejected_while_its_first_job_runs_ends_and_says_why(
+    rig: JobRig, caplog: pytest.LogCaptureFixture
+) -> None:
+    rig.session("a")
+    rig.session("b")
+    queue = JobQueue(rig.store, "swdt82", rig.clock)
+    queue.queue(DueChain(CHAIN, "b", "b"))
+    gap = queue.state().jobs[0]
+    assert queue.begin(gap, 60.0)
+    rejected(rig, "b")
+    made = {"model": "/x", "manifest_sha256": "0", "stage": "geometric", "sessions": ["a", "b"], "metrics": {}}
+    queue.end(gap.id, Outcome("done", result=made))
+    rig.start()
+    rig.wait(lambda: rig.states() == ["done", *["cancelled"] * 3, *["done"] * 4], "the chain without b")
+    why = "session b, on which its model was trained, is not used any more: it was rejected by Ada: measured on w"
+    assert rig.job(2)["error"].startswith(why)
+    assert f"job 2 (residual) is cancelled: {why}" in caplog.text
+    assert rig.job(3)["error"] == "it needs job 2, which was cancelled"
+    assert [o["train_ids"] for o in rig.orders() if o["kind"] == "residual"] == [["a"]]
+
+
+def test_a_model_that_waits_is_the_one_that_a_check_session_judges_though_its_residual_was_cancelled(
+    rig: JobRig,
+) -> None:
+    rig.session("a")
+    rig.start()
+    rig.wait_for(*["done"] * 4)
+    rig.plan(residual="fail")
+    rig.session("b")
+    rig.clock.advance(3.0)
+    rig.wait(lambda: rig.states()[4:] == ["done", "failed", "cancelled", "cancelled"], "the failed chain")
+    waiting = model_table(rig).waiting()
+    assert waiting is not None
+    rig.session("c", kind="check")
+    rig.clock.advance(3.0)
+    rig.wait(lambda: rig.states()[8:] == ["done"] * 2, "report and comparison")
+    assert {o["model"] for o in rig.orders()[-2:]} == {str(waiting.path)}
+    assert model_table(rig).get(waiting.id).comparison is not None
 
 
 def test_a_proposal_that_was_trained_on_a_check_is_made_again_without_it_once_it_is_rejected(
@@ -124,7 +226,7 @@ def test_a_proposal_that_was_trained_on_a_check_is_made_again_without_it_once_it
     rig.plan(drift=f"scores {CLIP} {CLIP}")
     check(rig, "c1", jobs=7)
     check(rig, "c2", jobs=14)
-    SessionLifecycle(rig.store, SOURCE.rig, rig.clock, 10.0, lambda: None).reject("c2", "Ada", "measured on w")
+    rejected(rig, "c2")
 
     def trained() -> list[list[str]]:
         return [order["session_ids"] for order in rig.orders() if order["kind"] == "gap"]
@@ -301,6 +403,15 @@ def test_status_says_why_nothing_came_of_the_newest_session_until_something_does
     rig.clock.advance(3.0)
     rig.wait(lambda: rig.states()[4:] == ["done"] * 4)
     assert lines(rig)[0] == "gap (none, after session b): they agree"
+
+
+def test_status_gives_no_verdict_that_rests_on_a_session_which_is_not_used_any_more(rig: JobRig) -> None:
+    rig.session("a")
+    rig.start()
+    rig.wait_for(*["done"] * 4)
+    assert lines(rig) == ["gap (none, after session a): they agree", "  report: r"]
+    rejected(rig, "a")
+    assert lines(rig) == []
 
 
 def test_what_makes_no_sense_in_the_table_is_refused_by_the_store(rig: JobRig) -> None:

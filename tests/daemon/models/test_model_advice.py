@@ -10,8 +10,11 @@ from typing import NoReturn
 import pytest
 
 from daemon.cli.lines.state import model_lines
-from daemon.commands import CommandError
-from tests.daemon.support.models import ModelRig
+from daemon.commands import CHECK, CommandError
+from daemon.next_step import next_line
+from daemon.sessions.lifecycle import SessionLifecycle
+from tests.daemon.support.jobs import SOURCE
+from tests.daemon.support.models import PRISMS, ModelRig
 
 
 @pytest.fixture
@@ -43,6 +46,32 @@ def checked(rig: ModelRig) -> tuple[int, int]:
         result = {"result_json": {"model": "none", "sessions": ["a"]}}
         rig.store.insert("jobs", job | result | rig.store.instant(rig.clock.now(), "created_"))
     return stale(rig)
+
+
+def rejected(rig: ModelRig, name: str) -> None:
+    SessionLifecycle(rig.store, SOURCE.rig, rig.clock, 10.0).reject(name, "Ada", "measured on w")
+    rig.clock.advance(3600.0)
+
+
+def compared_on_check(rig: ModelRig) -> int:
+    """A candidate that was trained on session a and was found better on check session c."""
+    rig.jobs.measured("a", 5, prisms=PRISMS)
+    rig.jobs.measured("c", 4, CHECK, prisms=PRISMS)
+    model = rig.candidate()
+    rig.registry.compare_command({"id": model})
+    rig.compare()
+    assert f"`rigcal model accept {model}`" in advice(rig)
+    return model
+
+
+def refusal(rig: ModelRig, model: int) -> str:
+    """Why a candidate is refused, as `status` and `model accept` say."""
+    with pytest.raises(CommandError) as refused:
+        rig.registry.accept_command({"id": model})
+    candidate = rig.registry.status()["candidate"]
+    assert not candidate["is_acceptable"]
+    assert candidate["refused_because"] in str(refused.value)
+    return str(refused.value)
 
 
 def comparisons(rig: ModelRig, model: int) -> list[str]:
@@ -126,6 +155,62 @@ def test_a_comparison_that_fails_is_not_made_again_for_ever(rig: ModelRig) -> No
     rig.jobs.look_on(5)
     assert comparisons(rig, waiting) == ["failed"]
     assert "model accept" not in advice(rig)
+
+
+@pytest.mark.long
+def test_a_model_whose_only_check_was_rejected_waits_for_another_check(rig: ModelRig) -> None:
+    model = compared_on_check(rig)
+    rejected(rig, "c")
+    start, _, end = refusal(rig, model).partition("measured on w")
+    why = "was compared on session c, which calibration does not use any more (it was rejected by Ada: "
+    assert start == f"model {model} {why}"
+    told = ": hold a check session (`rigcal session start --kind check`)"
+    assert end.endswith(f"{told}; `rigcal model compare {model}` compares it again")
+    (shown,) = rig.registry.list_command({})
+    assert shown["comparison"]["is_stale"]
+    assert shown["comparison"]["stale_because"].startswith("on session c, which")
+    status = {"setup": {"state": "ok"}, "gap": None, "session": None, "jobs": [], "alarms": {"active": []}}
+    step = next_line(status | {"models": rig.registry.status()})
+    assert "hold a check session" in step
+    assert "other prisms" not in step
+
+
+@pytest.mark.long
+def test_a_model_that_was_trained_on_a_rejected_session_is_not_recommended(rig: ModelRig) -> None:
+    model = compared_on_check(rig)
+    rejected(rig, "a")
+    why = "it was trained on session a, which calibration does not use any more (it was rejected by Ada: measured on w"
+    assert refusal(rig, model).startswith(f"model {model} cannot go live: {why}")
+    assert rig.registry.status()["candidate"]["is_outdated"]
+
+
+@pytest.mark.long
+def test_a_comparison_that_was_made_while_the_live_model_was_away_does_not_count_once_it_is_back(rig: ModelRig) -> None:
+    live = rig.accepted()
+    rig.jobs.measured("c", 4, CHECK, prisms=PRISMS)
+    waiting = rig.candidate()  # the very same model, so it cannot be better
+    path = rig.models.get(live).path
+    away = path.rename(path.with_name("away"))
+    rig.registry.compare_command({"id": waiting})
+    assert rig.compare()["live_was_unreadable"]
+    assert f"`rigcal model accept {waiting}`" in advice(rig), "nothing else can replace a model that is lost"
+    away.rename(path)
+    assert refusal(rig, waiting) == (
+        f"model {waiting} was compared when the files of model {live} could not be read, but now they can; "
+        f"`rigcal model compare {waiting}` compares it again"
+    )
+    rig.registry.compare_command({"id": waiting})
+    assert not rig.compare()["live_was_unreadable"]
+    assert "could not be read" not in refusal(rig, waiting)
+
+
+@pytest.mark.long
+def test_a_model_that_no_check_could_judge_waits_for_a_check(rig: ModelRig) -> None:
+    rig.jobs.measured("c", 4, CHECK, prisms=PRISMS)
+    model = rig.candidate(sessions=("c",))
+    rig.registry.compare_command({"id": model})
+    assert rig.compare()["sessions"] == []
+    assert "hold a check session (`rigcal session start --kind check`)" in refusal(rig, model)
 
 
 def test_without_a_check_session_nothing_is_compared_again(rig: ModelRig) -> None:

@@ -24,6 +24,7 @@ from daemon.jobs.runner import JobRunner
 from daemon.jobs.scheduler import CHAIN, DueChain
 from daemon.models.live_model import LiveModel, Loaded, Missing
 from daemon.models.model_files import model_sha256, write_model
+from daemon.sessions.lifecycle import SessionLifecycle
 from daemon.store.errors import NotInStoreError
 from daemon.store.migrations import MIGRATIONS
 from daemon.store.queries.models import ModelRow, ModelTable
@@ -226,7 +227,21 @@ def test_a_verdict_that_changes_while_the_model_is_loaded_does_not_count(
 
     monkeypatch.setattr(rig.live, "load", load)
     told = refusal(rig.registry.accept_command, REFUSED, id=model)
-    assert "the models were changed in the meantime by another command" in told
+    assert "models or sessions were changed in the meantime by another command" in told
+    assert states(rig) == {model: "candidate"}
+
+
+def test_a_session_that_is_rejected_while_the_model_is_loaded_keeps_it_from_going_live(
+    rig: ModelRig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = rig.compared(rig.candidate(), live=None)
+
+    def load(row: ModelRow) -> None:
+        SessionLifecycle(rig.store, SOURCE.rig, rig.clock, 10.0).reject("a", "Ada", "measured on w")
+
+    monkeypatch.setattr(rig.live, "load", load)
+    told = refusal(rig.registry.accept_command, REFUSED, id=model)
+    assert "models or sessions were changed in the meantime" in told
     assert states(rig) == {model: "candidate"}
 
 

@@ -9,7 +9,7 @@ from daemon.alarms.rules.sessions import setup_moved
 from daemon.commands import CommandError, acting_for
 from daemon.store.queries.guides import GuideTable
 from daemon.store.queries.sessions import SessionTable
-from daemon.store.queries.setups import SetupTable
+from daemon.store.queries.setups import SetupRow, SetupTable
 from tests.daemon.support.sessions import Rig, controlled
 
 CP1 = (9000.0, 500.0, 2000.0)
@@ -73,6 +73,13 @@ def test_the_next_session_is_held_where_the_last_one_was(rig: Rig) -> None:
     rig.say("stop")
     assert [one["is_current"] for one in rig.say("setup_list")] == [True, False]
     assert rig.say("start", prism="r")["setup"] == "S1"
+
+
+def test_the_station_stays_where_it_stands_when_the_rig_gets_another_name(rig: Rig) -> None:
+    rig.say("start", prism="r", setup="S1")
+    rig.live(1)
+    rig.say("stop")
+    assert SetupTable(rig.store, "renamed").current() == table(rig).current() == SetupRow("S1", "ok")
 
 
 def test_control_shots_are_those_of_the_set_up_in_use(rig: Rig) -> None:

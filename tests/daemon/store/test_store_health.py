@@ -15,10 +15,12 @@ import pytest
 from click.testing import CliRunner
 
 from daemon.cli.main import main
-from daemon.commands import CommandError
+from daemon.commands import REFUSED, CommandError
 from daemon.composition import Parts, joiner
 from daemon.config.config import Config
+from daemon.control.command_table import COMMANDS
 from daemon.control.protocol import request
+from daemon.control_commands import UNGUARDED
 from daemon.service import Daemon
 from daemon.store import Reader, Store, StoreError
 from daemon.store.files import FileIdentity
@@ -259,7 +261,7 @@ def test_a_store_that_is_gone_hides_neither_its_alarm_nor_anything_else_while_a_
         wait_until(lambda: request(config.socket_path, "status")["alarms"]["active"])
         status = request(config.socket_path, "status")
         assert [alarm["kind"] for alarm in status["alarms"]["active"]] == ["store_unsound"]
-        assert "replaced or removed" in status["unreadable"]["session"]
+        assert (status["session"]["state"], status["unreadable"].get("session")) == ("open", None)
         assert status["acquisition"]["links"][0]["name"] == "boom"
 
 
@@ -309,13 +311,47 @@ def test_a_damaged_table_keeps_no_daemon_from_starting_and_acquiring(tmp_path: P
         assert status["acquisition"]["error"] is None
 
 
-def test_no_session_is_started_in_a_store_whose_file_is_gone(tmp_path: Path) -> None:
+def test_no_command_that_would_change_a_store_whose_file_is_gone_is_carried_out(tmp_path: Path) -> None:
     with running(tmp_path) as (config, daemon):
         request(config.socket_path, "setup.new", {"id": "S1"})
         config.store_path.rename(tmp_path / "aside")
         wait_until(lambda: daemon.store_health.state == "missing")
-        with pytest.raises(CommandError, match=r"the session is not started.*the file that rigcal writes to is gone"):
-            request(config.socket_path, "session.start", {"prism": "r"})
+        for command, arguments in [
+            ("session.start", {"prism": "r"}),
+            ("guide.start", {}),
+            ("setup.new", {"id": "S2"}),
+            ("session.accept", {"id": "s001-r"}),
+            ("session.reject", {"id": "s001-r"}),
+            ("jobs.retry", {"id": 1}),
+            ("model.accept", {"id": 1}),
+            ("model.zeros-checked", {}),
+            ("store.prune", {"days": 1}),
+            ("store.redecode", {"session": "s001-r"}),
+        ]:
+            with pytest.raises(CommandError, match=r"not carried out: .*the file that rigcal writes to is gone") as no:
+                request(config.socket_path, command, arguments)
+            assert no.value.status == REFUSED
+        assert [setup["id"] for setup in request(config.socket_path, "setup.list")] == ["S1"]
+
+
+def test_every_exception_from_that_is_a_command_that_changes_something() -> None:
+    assert {name for name, command in COMMANDS.items() if command.changes}.issuperset(UNGUARDED)
+
+
+@pytest.mark.parametrize(("command", "state"), [("session.stop", "closed"), ("session.abort", "aborted")])
+def test_a_session_can_be_ended_while_the_store_s_file_is_gone_and_the_answer_says_what_may_be_lost(
+    tmp_path: Path, command: str, state: str
+) -> None:
+    with running(tmp_path) as (config, daemon):
+        request(config.socket_path, "setup.new", {"id": "S1"})
+        request(config.socket_path, "session.start", {"prism": "r", "id": "first"})
+        config.store_path.rename(tmp_path / "aside")
+        wait_until(lambda: daemon.store_health.state == "missing")
+        answer = request(config.socket_path, command)
+        assert (answer["id"], answer["state"]) == ("first", state)
+        assert "may be lost when the daemon stops" in answer["advice"][-1]
+        assert "the file that rigcal writes to is gone" in answer["advice"][-1]
+        assert request(config.socket_path, "status")["session"] is None
 
 
 def test_a_damaged_table_hides_nothing_else_from_status(tmp_path: Path) -> None:
