@@ -180,8 +180,8 @@ class JobQueue:
     def begin(self, job: JobFacts, time_limit_s: float, host_boot: str | None = None) -> bool:
         """Mark a queued job as running and clear what earlier runs left; return False if it does not run.
 
-        It does not if it is no longer queued. It is cancelled if a session on which its model was trained is not used
-        any more, for example because an operator has rejected it while an earlier job of the chain ran.
+        It does not if it is no longer queued. It is cancelled if an operator has rejected a session on which its model
+        was trained, and in a chain also if such a session is not used any more for another reason.
 
         Args:
             job: the job.
@@ -192,9 +192,7 @@ class JobQueue:
             row = self.table.get(job.id)
             if row["state"] != "queued":
                 return False
-            if (model := self._model_of(row)) is not None and (unused := self._models.not_used(model.sessions)):
-                name, why = unused
-                gone = f"session {name}, on which its model was trained, is not used any more: {why}"
+            if (gone := self._why_void(row)) is not None:
                 self.end(job.id, Outcome("cancelled", gone))
                 return False
             self.table.change(
@@ -213,6 +211,16 @@ class JobQueue:
                 ended_boot_id=None,
             )
             return True
+
+    def _why_void(self, row: Mapping[str, Any]) -> str | None:
+        """Return why a queued job must not run, a clause; None if it may."""
+        model = self._model_of(row)
+        if model is None:
+            return None
+        unused = self._models.not_used(model.sessions, only_if_rejected=row["depends_on"] is None)
+        if unused is None:
+            return None
+        return f"session {unused[0]}, on which its model was trained, is not used any more: {unused[1]}"
 
     def note_process(self, job_id: int, pid: int) -> None:
         """Store the process id of a running job."""

@@ -117,8 +117,9 @@ class LiveModel(WorkerThread):
         live, drifted = self.now(), self._table.drifted(run)
         drifted_with = None if drifted is None else drifted[1]
         if isinstance(live, Loaded):
-            rejected = self._table.rejected(live.sessions)
-            return LiveModelHealth(run.model_id, live.jumped, drifted_with=drifted_with, rejected=rejected)
+            rejected = self._table.not_used(live.sessions, only_if_rejected=True)
+            rejected_id = None if rejected is None else rejected[0]
+            return LiveModelHealth(run.model_id, live.jumped, drifted_with=drifted_with, rejected=rejected_id)
         reason = live.reason if live.is_defect else ""
         defect, hindrance = ("", reason) if live.is_hindered else (reason, "")
         return LiveModelHealth(run.model_id, (), defect, hindrance, drifted_with)

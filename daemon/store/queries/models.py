@@ -149,21 +149,17 @@ class ModelTable:
         newest = self.newest()
         return newest if newest is not None and newest.state == "candidate" else None
 
-    def not_used(self, session_ids: Collection[str]) -> tuple[str, str] | None:
+    def not_used(self, session_ids: Collection[str], *, only_if_rejected: bool = False) -> tuple[str, str] | None:
         """Return the first of some sessions that calibration does not use any more, and why, a clause; None if all are.
 
         Args:
             session_ids: closed sessions; unknown ones are ignored.
+            only_if_rejected: ask only for sessions that an operator has rejected.
         """
+        column = "rejected_utc_ns" if only_if_rejected else "excluded"
         sql = f"""SELECT id, excluded FROM calibration_sessions
-            WHERE id IN ({marks(session_ids)}) AND excluded IS NOT NULL ORDER BY rowid LIMIT 1"""
+            WHERE id IN ({marks(session_ids)}) AND {column} IS NOT NULL ORDER BY rowid LIMIT 1"""
         return next(((row["id"], row["excluded"]) for row in self._store.rows(sql, (*session_ids,))), None)
-
-    def rejected(self, session_ids: Collection[str]) -> str | None:
-        """Return the first of some sessions that an operator has rejected; None if none was."""
-        sql = f"""SELECT id FROM calibration_sessions
-            WHERE id IN ({marks(session_ids)}) AND rejected_utc_ns IS NOT NULL ORDER BY rowid LIMIT 1"""
-        return next((str(row["id"]) for row in self._store.rows(sql, (*session_ids,))), None)
 
     def predecessor(self, model: ModelRow) -> int | None:
         """Return the number of the model that was live when this one was accepted; None for the first model."""
