@@ -70,6 +70,7 @@ class SessionManager:
 
     Attributes:
         turn: held while a command is carried out, and entered before a transaction of several commands.
+        pending: what `on_records` has concluded, to be stored together with the records.
     """
 
     def __init__(
@@ -98,9 +99,9 @@ class SessionManager:
         self._aim, self._why_no_fix = aim, why_no_fix
         self.turn = CommandTurn()
         self._shot: Shot | None = None
-        self._pending = PendingWrites(store)
-        self._prisms = PrismWatch(store, rig, clock, limits, self._pending.add_event)
-        self._observing = ObservationMaker(rig, store, self._observations, self._pending, self._prisms, run_id)
+        self.pending = PendingWrites(store)
+        self._prisms = PrismWatch(store, rig, clock, limits, self.pending.add_event)
+        self._observing = ObservationMaker(rig, store, self._observations, self.pending, self._prisms, run_id)
         self._advice = SessionAdvice(rig, setups, self._table, self._prisms)
         self._late: set[str] = set()  # sessions that got fixes after their end, and must be judged again
         # Fixes measured in ended sessions may still arrive, or wait for their joints
@@ -111,12 +112,12 @@ class SessionManager:
     # ---- the writer thread -------------------------------------------------------------------------------------------
 
     def on_records(self, records: Sequence[Record]) -> None:
-        """Process records that have just been stored: complete a shot, or store observations of the open session."""
+        """Process records that are about to be stored: complete a shot, or make observations of the open session."""
         has_jumped = False
         for record in records:
             if isinstance(record, Fix):
-                if self._shot is not None:
-                    self._shot.take(record, self._store.order)
+                if (shot := self._shot) is not None:  # a shot names its fixes, which must be stored before
+                    self.pending.once_stored(partial(shot.take, record, self._store.order))
                 self._watch_prism(record)
             elif isinstance(record, DeviceEvent) and record.kind is EventKind.PRESET_JUMP:
                 for session in self._taking():
@@ -124,15 +125,14 @@ class SessionManager:
                         session.jumped.setdefault(record.device, record.stamp)
                 has_jumped = True
         if has_jumped:
-            self._pending.add(self._lifecycle.judge_zeros)
+            self.pending.add(self._lifecycle.judge_zeros)
         observing = [self._observe(joined) for joined in self._joiner.feed(records)]
         late = [session.id for session in observing if session is not None and session.until is not None]
         self._late.update(late)
         if not late:  # no late fixes at present
             for session_id in self._late:
-                self._pending.add(partial(self._lifecycle.judge_again, session_id))
+                self.pending.add(partial(self._lifecycle.judge_again, session_id))
             self._late.clear()
-        self._pending.store()
 
     def is_of_session(self, stamp: Stamp) -> bool:
         """Return True if an instant lies in the open session, or in an ended one that may still get fixes."""

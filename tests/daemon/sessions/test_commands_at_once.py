@@ -39,7 +39,7 @@ def shoot_without_storing_fixes(rig: Rig) -> dict[str, Any] | sqlite3.Error:
     asking.start()
     while asking.is_alive():
         rig.clock.advance(STEP_S)
-        rig.keeper.on_records([rig.fix()])
+        rig.tell([rig.fix()])
     asking.join()
     return answers[0]
 
@@ -128,7 +128,7 @@ def tell_a_fix_of_the_far_future(rig: Rig) -> None:
     """Tell of a fix whose UTC no column can hold: acquisition could not store it either."""
     rig.clock.advance(STEP_S / 2)
     fix = rig.fix()
-    rig.keeper.on_records([replace(fix, stamp=replace(fix.stamp, utc_ns=2**63))])
+    rig.tell([replace(fix, stamp=replace(fix.stamp, utc_ns=2**63))])
 
 
 # ---- callers that leave ----------------------------------------------------------------------------------------------
