@@ -62,8 +62,10 @@ class ShotTimes:
         finally:
             if self._aim is not None:
                 self._aim(session.prism)
-            shot.until = self._clock.now()
-            self._note_end(session, point, shot.until)
+            try:
+                self._note_end(session, point, self._clock.now())
+            finally:
+                shot.until = self._clock.now()  # only now, because until then the shot's caller waits
 
     def _note(self, kind: EventKind, at: Stamp, text: str) -> None:
         self._store.insert_records([DeviceEvent(station, at, kind, text) for station in self._stations])

@@ -18,6 +18,7 @@ import pytest
 from daemon.commands import CommandTurn, acting_for
 from daemon.control.server import ControlServer
 from daemon.store.queries.observations import OF_CONTROL_POINT
+from tests.daemon.support.acquisition import wait_until
 from tests.daemon.support.damage import fill_up, make_room
 from tests.daemon.support.sessions import STEP_S, Rig, disk_fails
 from tests.daemon.support.store import table
@@ -37,6 +38,7 @@ def shoot_without_storing_fixes(rig: Rig) -> dict[str, Any] | sqlite3.Error:
 
     asking = threading.Thread(target=ask)
     asking.start()
+    wait_until(lambda: rig.keeper._shot is not None or not asking.is_alive())
     while asking.is_alive():
         rig.clock.advance(STEP_S)
         rig.tell([rig.fix()])
