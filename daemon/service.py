@@ -129,6 +129,7 @@ class Daemon:
             store,
             parts.clock,
             on_records=self._on_records,
+            also_store=self._sessions.pending.store,
             expected=expected_of(config, parts.rig),
             clock_watch=ClockWatch(before) if parts.mode == "live" else None,
             thinning=None if parts.mode == "replayed" else Thinning(self._sessions.is_of_session),
@@ -340,7 +341,7 @@ class Daemon:
         try:
             self._sessions.on_records(records)  # feeds the joiner, which the tip reads
         finally:
-            self._tip.on_records(records)  # even if an observation cannot be stored: an encoder may have jumped
+            self._tip.on_records(records)  # even if an observation cannot be made: an encoder may have jumped
             self._guide.on_records(records)
 
 

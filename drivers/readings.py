@@ -172,6 +172,8 @@ class EventKind(StrEnum):
     LOCK_LOST = "lock_lost"
     PRISM_JUMP = "prism_jump"  # the station's target jumped: it may follow a different prism
     PRISM_CONFIRMED = "prism_confirmed"  # an operator confirmed that the station is on the intended prism
+    SHOT_BEGUN = "shot_begun"  # of a control point: the station is on no prism until the shot has ended
+    SHOT_ENDED = "shot_ended"
     STATION_SILENT = "station_silent"
     INSTRUMENT_ERROR = "instrument_error"
     CLOCK_STEP = "clock_step"  # the computer's clock was set; the code is the change in milliseconds

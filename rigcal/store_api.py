@@ -11,8 +11,8 @@ from calibration.errors import DataError
 from calibration.observations import Observations
 from calibration.rig.description import Rig, parse_rig
 from daemon.sessions.session_data import require_used, sessions_csv
-from daemon.store.queries.observations import all_observations
-from daemon.store.queries.sessions import all_sessions, session
+from daemon.store.queries.observations import OBSERVATION_COLUMNS, all_observations
+from daemon.store.queries.sessions import SESSION_COLUMNS, all_sessions, session
 from daemon.store.reader import Reader
 
 if TYPE_CHECKING:
@@ -70,7 +70,7 @@ class Store:
             (None while it is open), and `not_used` (the reason why calibration does not use the session; None, in
             pandas perhaps NaN, if it does).
         """
-        return self._frame(all_sessions(self._reader))
+        return self._frame(all_sessions(self._reader), SESSION_COLUMNS)
 
     def observations(self, sessions: Sequence[str] = ()) -> pd.DataFrame | pl.DataFrame:
         """Return the observations of sessions, oldest first, including those that calibration must not use.
@@ -87,7 +87,7 @@ class Store:
             DataError: there is no such session.
         """
         self._require(sessions)
-        return self._frame(all_observations(self._reader, sessions))
+        return self._frame(all_observations(self._reader, sessions), OBSERVATION_COLUMNS)
 
     def training_data(self, sessions: Sequence[str]) -> tuple[Rig, Observations]:
         """Return the rig of sessions and the observations that calibration may use, as the daemon's jobs do.
@@ -122,12 +122,14 @@ class Store:
             rows.append(row)
         return rows
 
-    def _frame(self, rows: Iterable[Mapping[str, Any]]) -> pd.DataFrame | pl.DataFrame:
+    def _frame(self, rows: Iterable[Mapping[str, Any]], columns: Sequence[str]) -> pd.DataFrame | pl.DataFrame:
+        """Return a frame of rows; one without rows has the given columns."""
         table = [dict(row) for row in rows]
+        names = None if table else list(columns)
         if self._frames == "polars":
             import polars as pl
 
-            return pl.DataFrame(table, infer_schema_length=None)
+            return pl.DataFrame(table, schema=names, infer_schema_length=None)
         import pandas as pd
 
-        return pd.DataFrame(table)
+        return pd.DataFrame(table, columns=names)

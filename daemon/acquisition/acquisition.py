@@ -1,9 +1,10 @@
 """Acquisition: one thread per link, bounded queues, and a single writer thread.
 
-The writer drains the queues, commits the raw captures, decodes them batch by batch, commits the records, and hands
-them on. Raw captures are always committed first, even while decoding is not possible. A process that ends between the
-two commits leaves chunks marked as undecoded in the store; the next process starts capturing at once, and decodes those
-chunks before its own (`daemon.acquisition.backlog`). A replay runs the same writer without threads (`run_inline`).
+The writer drains the queues, commits the raw captures, decodes them batch by batch, hands the records on, and commits
+them together with what was concluded from them. Raw captures are always committed first, even while decoding is not
+possible. A process that ends between the two commits leaves chunks marked as undecoded in the store; the next process
+starts capturing at once, and decodes those chunks before its own (`daemon.acquisition.backlog`). A replay runs the same
+writer without threads (`run_inline`).
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from typing import TypeVar
 from daemon.acquisition.backlog import BATCH_CAPTURES, Backlog, Batch
 from daemon.acquisition.clock_watch import ClockWatch
 from daemon.acquisition.link_decoders import TICK_NS, LinkDecoders
-from daemon.acquisition.link_intake import LinkIntake, in_time_order, stamp_of
+from daemon.acquisition.link_intake import LinkIntake, in_time_order, stamp_of, tell_of_links
 from daemon.acquisition.status.board import StatusBoard
 from daemon.acquisition.status.present import NOTHING_EXPECTED, Expected
 from daemon.acquisition.status.snapshot import AcquisitionStatus
@@ -35,7 +36,6 @@ from drivers.readings import (
     DecodeFailure,
     Decoder,
     DeviceEvent,
-    EventKind,
     LinkItem,
     LinkLoop,
     Record,
@@ -51,14 +51,12 @@ RETRY_S = 1.0
 WRITE_HUNG_S = 4.0  # real seconds after which a write that has not ended is told
 STOP_S = 15.0  # real seconds
 LINKS_STOP_S = 5.0  # part of STOP_S for all links together, which check `stop` several times a second
-LAST_RETRIES = 3  # when stopping, RETRY_S apart; then captures that could not be stored are discarded and counted
+LAST_RETRIES = 3  # when stopping, RETRY_S apart; then captures that could not be stored are lost, and counted
 INLINE_CAPTURES = 4096
 INLINE_SPAN_NS = NS_PER_S
 
 # Faults of a record, not of the disk: out of a column's range or type, text that is not UTF-8.
 _REFUSED = (sqlite3.IntegrityError, sqlite3.ProgrammingError, ArithmeticError, TypeError, ValueError)
-
-_LINK_LEVELS = {EventKind.LINK_UP: logging.INFO, EventKind.LINK_LOST: logging.WARNING}
 
 
 class AcquisitionError(Exception):
@@ -78,8 +76,10 @@ class Acquisition:
         batch_seconds: how long captures are gathered before they are committed, in real time; it limits how often the
             disk must sync.
         queue_captures: how many captures of one link may wait while the disk is slow.
-        on_records: called in the writer thread with records after they are committed, and with an empty list when time
-            has passed (ten times a second). It must commit its own writes.
+        on_records: called in the writer thread with each batch of records once, before it is committed, and with an
+            empty list when time has passed (ten times a second).
+        also_store: called in the transaction that commits them, to store what `on_records` has concluded. If the disk
+            refuses, it is called again; if the process ends before, the next start decodes the captures again.
         expected: devices from which data are expected, for `status`.
         clock_watch: detects steps of the computer's clock, live; None where a different clock is used.
         thinning: chooses the readings and fixes to store; all by default.
@@ -95,11 +95,12 @@ class Acquisition:
         batch_seconds: float = 0.05,
         queue_captures: int = 200_000,
         on_records: Callable[[Sequence[Record]], None],
+        also_store: Callable[[], None] = lambda: None,
         expected: Expected = NOTHING_EXPECTED,
         clock_watch: ClockWatch | None = None,
         thinning: Thinning | None = None,
     ) -> None:
-        self._store, self._clock, self._on_records = store, clock, on_records
+        self._store, self._clock, self._on_records, self._also_store = store, clock, on_records, also_store
         self._thinning = thinning
         self._batch_seconds = batch_seconds
         self._intakes = [LinkIntake(link, clock, queue_captures, store.begun or clock.now()) for link in links]
@@ -217,9 +218,13 @@ class Acquisition:
                 elif self._backlog.is_empty:
                     self._finish.wait(self._batch_seconds)
             self._note_alive(self._take_in(self._clock.now()))
-            while not self._decode_until.is_over and not (self._backlog.is_empty and self._decoded is None):
+            tries_left = LAST_RETRIES
+            while (
+                tries_left and not self._decode_until.is_over and not (self._backlog.is_empty and self._decoded is None)
+            ):
                 if not self._decode_next(self._clock.now()):
-                    break
+                    tries_left -= 1
+                    time.sleep(min(RETRY_S, self._decode_until.left_s))
         except Exception as error:
             why = storage_sentence(self._store.path, error) if isinstance(error, sqlite3.DatabaseError) else None
             log.critical("the writer failed; nothing is stored any more: %s", why or error, exc_info=why is None)
@@ -251,7 +256,7 @@ class Acquisition:
         for batch in batches:
             self._board.captured(batch.captures)
             self._backlog.add(batch)
-            _tell_of_links(batch.reports)
+            tell_of_links(batch.reports)
         return read_until
 
     def _decode_next(self, now: Stamp) -> bool:
@@ -265,12 +270,11 @@ class Acquisition:
         decoded = self._decoded
         if decoded is None:
             return True
-        if (decoded.records or decoded.chunk_ids) and not self._try(
-            "decoded records", partial(self._commit_records, decoded.records, decoded.chunk_ids)
-        ):
+        if not self._try("decoded records", partial(self._commit_records, decoded.records, decoded.chunk_ids)):
             return False
         self._decoded = None
-        self._hand_on([*decoded.reports, *decoded.records], decoded.until)
+        if not self._is_left_over:  # records of an earlier run do not show the present state
+            self._board.recorded(decoded.told, decoded.until)
         return True
 
     def _decode(self, now: Stamp) -> None:
@@ -289,7 +293,8 @@ class Acquisition:
             records += self._decoding.tick(now)
             self._next_tick_ns = now.monotonic_ns + TICK_NS
             until = now
-        self._decoded = _Decoded(batch.chunk_ids, batch.reports, records, until)
+        self._decoded = _Decoded(batch.chunk_ids, records, [*batch.reports, *records], until)
+        self._hand_on(self._decoded.told)
 
     def _tell_of_left_overs(self, *, is_left_over: bool) -> None:
         self._is_left_over = is_left_over
@@ -337,10 +342,12 @@ class Acquisition:
     def _store_inline(self, items: Sequence[LinkItem]) -> None:
         for batch in self._commit_raw(items):
             self._board.captured(batch.captures)
-            _tell_of_links(batch.reports)
+            tell_of_links(batch.reports)
             records = self._decoding.feed_and_tick(batch.captures)
+            told = [*batch.reports, *records]
+            self._hand_on(told)
             self._commit_records(records, batch.chunk_ids)
-            self._hand_on([*batch.reports, *records], _end(batch.captures))
+            self._board.recorded(told, _end(batch.captures))
 
     # ---- the writer's work -----------------------------------------------------------------------------------------
 
@@ -364,6 +371,7 @@ class Acquisition:
         with self._store.transaction():
             self._insert(kept)
             self._store.mark_decoded(chunk_ids)
+            self._also_store()
 
     def _insert(self, records: Sequence[Record]) -> None:
         """Insert records; a record that the store refuses is replaced by a decode failure and blocks no others."""
@@ -378,14 +386,12 @@ class Acquisition:
             for record in records:
                 self._insert([record])
 
-    def _hand_on(self, records: Sequence[Record], until: Stamp | None) -> None:
-        if not self._is_left_over:  # records of an earlier run do not show the present state
-            self._board.recorded(records, until)
+    def _hand_on(self, records: Sequence[Record]) -> None:
         try:
             self._on_records(records)
         except Exception:
-            # The records are stored; a fault of their consumer must not end acquisition.
-            log.exception("records are stored, but could not be processed further")
+            # A fault of their consumer must neither end acquisition nor keep the records from being stored.
+            log.exception("records could not be processed further; they are stored")
 
     def _insist(self, work: Callable[[], T]) -> T:
         """Repeat `work` until the disk accepts it, and return its result; when stopping, retry only a few times."""
@@ -430,20 +436,13 @@ class Acquisition:
 
 @dataclass(frozen=True)
 class _Decoded:
-    """A decoded batch that is not stored yet: its chunks, the reports of its links, its records, and its end."""
+    """A decoded batch that is not stored yet: its chunks, its records, these with its links' reports, and its end."""
 
     chunk_ids: Sequence[int]
-    reports: Sequence[Record]
     records: Sequence[Record]
+    told: Sequence[Record]
     until: Stamp | None
 
 
 def _end(captures: Sequence[Capture]) -> Stamp | None:
     return captures[-1].stamp if captures else None
-
-
-def _tell_of_links(reports: Iterable[Record]) -> None:
-    """Log the state of links, so that the service's journal shows why a rig is silent."""
-    for report in reports:
-        if isinstance(report, DeviceEvent) and report.kind in _LINK_LEVELS:
-            log.log(_LINK_LEVELS[report.kind], "%s", report.text)

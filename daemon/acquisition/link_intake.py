@@ -28,6 +28,7 @@ from drivers.readings import (
 
 log = logging.getLogger(__name__)
 
+_LEVELS = {EventKind.LINK_UP: logging.INFO, EventKind.LINK_LOST: logging.WARNING}
 RESTART_S = 1.0
 LEFT_BEHIND_S = 10.0  # real seconds without reading after which a gap is recorded
 _LEFT_BEHIND_NS = 2 * NS_PER_S  # shortest wait where time runs slowly: links update `read_until` once a second
@@ -181,6 +182,13 @@ class LinkIntake:
 def stamp_of(record: LinkItem | Record) -> Stamp:
     """Return the stamp of a record, or the start of a gap."""
     return record.start if isinstance(record, Gap) else record.stamp
+
+
+def tell_of_links(reports: Iterable[Record]) -> None:
+    """Log the state of links, so that the service's journal shows why a rig is silent."""
+    for report in reports:
+        if isinstance(report, DeviceEvent) and report.kind in _LEVELS:
+            log.log(_LEVELS[report.kind], "%s", report.text)
 
 
 def in_time_order(queues: Iterable[Sequence[LinkItem]]) -> list[LinkItem]:

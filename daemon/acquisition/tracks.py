@@ -87,6 +87,11 @@ class History(Generic[T]):
             old = max(bisect_left(times_ns, at_ns - HISTORY_NS) - 1, 0)
             del times_ns[:old], self.items[:old]
 
+    def insert(self, index: int, at_ns: int, item: T) -> None:
+        """Insert an item that has arrived late at its place in the order of time."""
+        self.times_ns.insert(index, at_ns)
+        self.items.insert(index, item)
+
     def newer(self, at_ns: int) -> bool:
         """Return True if `at_ns` is later than all items."""
         return not self.times_ns or at_ns > self.times_ns[-1]
@@ -113,15 +118,33 @@ class Motion:
         """Note a motion of any joint, or that a joint is first read."""
         if self._moves.times_ns:
             quiet_ns = at_ns - self._moves.times_ns[-1]
+            if quiet_ns < 0:
+                self._note_late(at_ns)
+                return
             if quiet_ns < MOTION_STEP_NS:
                 return
             self._ended += quiet_ns >= self._settle_ns
         self._moves.add(at_ns, self._ended)
 
+    def _note_late(self, at_ns: int) -> None:
+        """Note a motion before the newest one, of a joint whose link is read later than those of others."""
+        times_ns, ended = self._moves.times_ns, self._moves.items
+        after = self._moves.latest(at_ns) + 1
+        since_ns = at_ns - times_ns[after - 1] if after else MOTION_STEP_NS
+        if since_ns < MOTION_STEP_NS or times_ns[after] - at_ns < MOTION_STEP_NS:
+            return
+        number = ended[after - 1] + (since_ns >= self._settle_ns) if after else ended[0]
+        if times_ns[after] - at_ns >= self._settle_ns and ended[after] == number:  # it divides a standstill into two
+            ended[after:] = [later + 1 for later in ended[after:]]
+            self._ended += 1
+        self._moves.insert(after, at_ns, number)
+
     def note_unseen(self, at_ns: int) -> None:
         """Note that a joint may have moved unseen until then, even if it is where it was."""
         if self._unseen.newer(at_ns):
             self._unseen.add(at_ns, None)
+        else:
+            self._unseen.insert(self._unseen.latest(at_ns) + 1, at_ns, None)
 
     def restart(self) -> None:
         """Begin a new standstill, because joints may have moved unnoticed."""

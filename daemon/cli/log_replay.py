@@ -84,7 +84,9 @@ def replay_logs(
             setups.new_command({"id": REPLAYED, "instrument": REPLAYED, "control_points": points})
             commands = _commands_of(told, sessions, clock.monotonic_ns())
             store.insert_records([_event_of(state) for state in told.device_states])
-        acquisition = Acquisition((), made, store, clock, on_records=sessions.on_records)
+        acquisition = Acquisition(
+            (), made, store, clock, on_records=sessions.on_records, also_store=sessions.pending.store
+        )
         acquisition.run_inline(_followed(merged(files, settings, told), clock, commands))
         for _, command in commands:  # commands after the last capture
             command()

@@ -35,9 +35,9 @@ from daemon.sessions.observing import ObservationMaker, PendingWrites
 from daemon.sessions.open_session import CONTROL_POINT_RADIUS_MM, OpenSession
 from daemon.sessions.prism_watch import PrismWatch, as_dict
 from daemon.sessions.prisms.guard import MotionLimit, Suspicion
+from daemon.sessions.shot_times import ShotTimes
 from daemon.sessions.station_setups import StationSetups
 from daemon.sessions.without_job import why_no_job
-from daemon.store.errors import is_unwritable
 from daemon.store.queries.jobs import JobTable
 from daemon.store.queries.observations import ObservationTable, first_constants_mm
 from daemon.store.store import Store
@@ -70,6 +70,7 @@ class SessionManager:
 
     Attributes:
         turn: held while a command is carried out, and entered before a transaction of several commands.
+        pending: what `on_records` has concluded, to be stored together with the records.
     """
 
     def __init__(
@@ -98,9 +99,10 @@ class SessionManager:
         self._aim, self._why_no_fix = aim, why_no_fix
         self.turn = CommandTurn()
         self._shot: Shot | None = None
-        self._pending = PendingWrites(store)
-        self._prisms = PrismWatch(store, rig, clock, limits, self._pending.add_event)
-        self._observing = ObservationMaker(rig, store, self._observations, self._pending, self._prisms, run_id)
+        self.pending = PendingWrites(store)
+        self._prisms = PrismWatch(store, rig, clock, limits, self.pending.add_event)
+        self._observing = ObservationMaker(rig, store, self._observations, self.pending, self._prisms, run_id)
+        self._shot_times = ShotTimes(store, clock, limits, aim, self._prisms.turned)
         self._advice = SessionAdvice(rig, setups, self._table, self._prisms)
         self._late: set[str] = set()  # sessions that got fixes after their end, and must be judged again
         # Fixes measured in ended sessions may still arrive, or wait for their joints
@@ -111,12 +113,12 @@ class SessionManager:
     # ---- the writer thread -------------------------------------------------------------------------------------------
 
     def on_records(self, records: Sequence[Record]) -> None:
-        """Process records that have just been stored: complete a shot, or store observations of the open session."""
+        """Process records that are about to be stored: complete a shot, or make observations of the open session."""
         has_jumped = False
         for record in records:
             if isinstance(record, Fix):
-                if self._shot is not None:
-                    self._shot.take(record, self._store.order)
+                if (shot := self._shot) is not None:  # a shot names its fixes, which must be stored before
+                    self.pending.once_stored(partial(shot.take, record, self._store.order))
                 self._watch_prism(record)
             elif isinstance(record, DeviceEvent) and record.kind is EventKind.PRESET_JUMP:
                 for session in self._taking():
@@ -124,15 +126,14 @@ class SessionManager:
                         session.jumped.setdefault(record.device, record.stamp)
                 has_jumped = True
         if has_jumped:
-            self._pending.add(self._lifecycle.judge_zeros)
+            self.pending.add(self._lifecycle.judge_zeros)
         observing = [self._observe(joined) for joined in self._joiner.feed(records)]
         late = [session.id for session in observing if session is not None and session.until is not None]
         self._late.update(late)
         if not late:  # no late fixes at present
             for session_id in self._late:
-                self._pending.add(partial(self._lifecycle.judge_again, session_id))
+                self.pending.add(partial(self._lifecycle.judge_again, session_id))
             self._late.clear()
-        self._pending.store()
 
     def is_of_session(self, stamp: Stamp) -> bool:
         """Return True if an instant lies in the open session, or in an ended one that may still get fixes."""
@@ -232,21 +233,13 @@ class SessionManager:
             name = identifier(arguments, "point", "a control point's name")
             if name in self._rig.prism_names:
                 raise CommandError(f"{name!r} is a prism of the rig; name a control point, which does not move with it")
-            shot = Shot(self._settings.fixes_per_shot, self._clock.now())
-            session.shots.append(shot)
-            try:
-                if self._aim is not None:
-                    self._aim(name)
-                shot.aimed = self._clock.now()
+            with self._shot_times.on_point(session, name, self._settings.fixes_per_shot) as shot:
                 self._shot = shot
-                shot.wait(self._clock, self._settings.shot_timeout_s, self._why_no_fix)
-                result = self._keep_shot(session, name, shot, most_off_mm)
-            finally:
-                self._shot = None
-                if self._aim is not None:
-                    self._aim(session.prism)
-                shot.until = self._clock.now()
-                self._note_turned(session, shot.until)
+                try:
+                    shot.wait(self._clock, self._settings.shot_timeout_s, self._why_no_fix)
+                    result = self._keep_shot(session, name, shot, most_off_mm)
+                finally:
+                    self._shot = None
             return result | {"advice": after_a_move(session.id) if result["moved"] else []}
 
     def zeros_checked(self) -> None:
@@ -287,7 +280,7 @@ class SessionManager:
         session = self._open
         if session is None:
             return None
-        suspicions = [as_dict(suspicion) for suspicion in self._prisms.suspicions(session)]
+        suspicions = [as_dict(suspicion) for suspicion in self.prism_suspicions()]
         shown = {"prism_suspicions": suspicions, "jumped": [j for j in self._rig.joint_names if j in session.jumped]}
         return self._table.summary(session.id, self._observations.tally) | shown
 
@@ -337,7 +330,7 @@ class SessionManager:
     def prism_suspicions(self) -> list[Suspicion]:
         """Return the stations that may be on a prism other than the open session's; may be called from any thread."""
         session = self._open
-        return [] if session is None else self._prisms.suspicions(session)
+        return [] if session is None else self._prisms.suspicions(session) or self._shot_times.suspicions(session)
 
     def prisms_fault(self) -> str | None:
         """Return why stations' prisms cannot be checked against the joints, a clause; None if they can."""
@@ -402,17 +395,6 @@ class SessionManager:
             self._store.once_committed(partial(session.know, points, first_constants_mm(self._store, session.id)))
         return result
 
-    def _note_turned(self, session: OpenSession, at: Stamp) -> None:
-        """Note that a program turned the station to the prism, if one does; if this cannot be stored, log it."""
-        if self._aim is None:
-            return
-        try:
-            self._prisms.turned(session, at)
-        except sqlite3.Error as error:
-            if not is_unwritable(error):
-                raise
-            log.warning("the turn of the station to prism %s could not be stored: %s", session.prism, error)
-
     def _close(self, state: str) -> OpenSession:
         """End the open session, in the store and then in memory; if the store refuses, it stays open in both."""
         session = self._needs_open()
@@ -439,6 +421,7 @@ class SessionManager:
             points = self._setups.control_points(session.setup_id, session.id)
             session.know(points, first_constants_mm(self._store, session.id))
             session.jumped = self._lifecycle.jumped(session)
+            session.cut_off = self._shot_times.cut_off(session)
             self._prisms.restore(session)
             self._observing.restore(session)
         if (opened := self._open) is None:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import logging
-import sqlite3
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 
@@ -40,7 +39,7 @@ _LEFT_OUT = "an observation of a session can never be stored, and was discarded"
 
 
 class PendingWrites:
-    """Pending changes of the store, in order; they wait while the store cannot be written.
+    """Pending changes of the store, in order, for the transaction that stores the records to which they are due.
 
     Args:
         store: the database.
@@ -49,7 +48,6 @@ class PendingWrites:
     def __init__(self, store: Store) -> None:
         self._store = store
         self._writes: list[Callable[[], object]] = []
-        self._is_waiting = False
 
     def add(self, write: Callable[[], object]) -> None:
         """Add a change; all pending changes are made in one transaction."""
@@ -59,27 +57,20 @@ class PendingWrites:
         """Add an event of a device."""
         self.add(lambda: self._store.insert_records([event]))
 
+    def once_stored(self, work: Callable[[], object]) -> None:
+        """Call `work`, which must be quick, once the changes that are pending now are committed."""
+        self.add(partial(self._store.once_committed, work))
+
     def store(self) -> None:
-        """Make all changes, or none while the store cannot be written; log and discard a change that can never be made.
+        """Make all changes, which are pending until they are committed; log and discard one that can never be made.
 
         Raises:
-            sqlite3.DatabaseError: the store is damaged and cannot commit; all changes are discarded.
+            sqlite3.DatabaseError: the store cannot be written at present.
         """
-        if not self._writes:
-            return
-        try:
+        if self._writes:
             with self._store.transaction():
+                self._store.once_committed(self._writes.clear)
                 self._make(self._writes)
-        except sqlite3.DatabaseError as error:
-            if not is_unwritable(error):
-                self._writes.clear()  # changes that can never be stored must not block later ones
-                raise
-            if not self._is_waiting:
-                log.error("observations cannot be stored (%s); they are kept in memory, and storing is retried", error)
-            self._is_waiting = True
-            return
-        self._writes.clear()
-        self._is_waiting = False
 
     def _make(self, writes: Sequence[Callable[[], object]]) -> None:
         """Make changes; a change that can never be made does not block the others."""

@@ -26,6 +26,7 @@ class OpenSession:
         since, until: fixes measured in between are of its prism, whichever run of the daemon decodes them; until is
             None while it is open.
         shots: times during which the station was on control points instead.
+        cut_off: start of a shot that the end of an earlier run cut off; the station may still be on its point.
         jumped: joint whose encoder jumped during the session -> instant of the jump.
         constants_mm: station -> prism constant of its first usable fix.
         control_points: places of the control points of its set-up, mm.
@@ -43,6 +44,7 @@ class OpenSession:
     since: Stamp
     until: Stamp | None = None
     shots: list[Shot] = field(default_factory=list)
+    cut_off: Stamp | None = None
     jumped: dict[str, Stamp] = field(default_factory=dict)
     constants_mm: dict[str, float] = field(default_factory=dict)
     control_points: list[Place] = field(default_factory=list)
@@ -57,9 +59,16 @@ class OpenSession:
 
     def has(self, stamp: Stamp) -> bool:
         """Return True if a fix of that instant is of the session's prism, not of a shot."""
-        return self.lasted(stamp) and not any(
-            lies_within(self.order, stamp, shot.since, shot.until) for shot in self.shots
-        )
+        away = [(shot.since, shot.until) for shot in self.shots]
+        if self.cut_off is not None:
+            away.append((self.cut_off, self.back()))
+        return self.lasted(stamp) and not any(lies_within(self.order, stamp, *time) for time in away)
+
+    def back(self) -> Stamp | None:
+        """Return when the station was back after a shot that was cut off: on a confirmation, or after another shot."""
+        ends = [one.at for one in self.confirmations]
+        ends += [shot.until for shot in self.shots if shot.aimed is not None and shot.until is not None]
+        return min((at for at in ends if lies_within(self.order, at, self.cut_off, None)), key=self.order, default=None)
 
     def confirmations_by(self, stamp: Stamp) -> int:
         """Return the number of times that an operator had confirmed its prism by then."""

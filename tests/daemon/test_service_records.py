@@ -35,8 +35,10 @@ def test_the_tip_hears_of_a_jump_that_comes_with_an_observation_that_cannot_be_s
         readings = [Reading(j.name, now, pose(1)[j.name], j.unit) for j in SOURCE.rig.joints]
         fix = Fix("station", now, now, Status.OK, LockState.LOCKED, 0.1, 1.5, 8.0)
         records: list[Record] = [*more, *readings, fix]
-        store.insert_records(records)
         daemon._on_records(records)
+        with store.transaction():
+            store.insert_records(records)
+            daemon._sessions.pending.store()
 
     def status() -> TipStatus:
         return daemon._tip.tip("r").status

@@ -42,6 +42,22 @@ def test_sessions_and_observations_are_frames(
     assert len(everything) == len(rows)
 
 
+@pytest.mark.parametrize("library", ["pandas", "polars"])
+def test_frames_of_a_store_without_sessions_have_their_columns(
+    written: tuple[Path, str], tmp_path: Path, library: Literal["pandas", "polars"]
+) -> None:
+    path, _ = written
+    new = Rig(tmp_path / "new.sqlite")
+    new.store.close()
+    with rigcal.open_store(tmp_path / "new.sqlite", library) as store:
+        sessions, rows = store.sessions(), store.observations()
+    assert (len(sessions), len(rows)) == (0, 0)
+    assert list(sessions["id"]) == list(rows["excluded"]) == []
+    with rigcal.open_store(path, library) as store:
+        assert list(sessions.columns) == list(store.sessions().columns)
+        assert set(rows.columns) <= set(store.observations().columns)
+
+
 def test_a_session_is_training_data(written: tuple[Path, str]) -> None:
     path, session = written
     with rigcal.open_store(path) as store:

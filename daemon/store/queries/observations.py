@@ -14,6 +14,10 @@ from daemon.store.places import since
 from daemon.store.rows import RowSource, marks
 from drivers.clock import Stamp
 
+OBSERVATION_COLUMNS = (
+    *("session_id", "setup_id", "prism", "pose", "utc_ns", "x_mm", "y_mm", "z_mm"),
+    *("sigma_x_mm", "sigma_y_mm", "sigma_z_mm", "dwell_s", "excluded"),
+)
 OF_CONTROL_POINT = "a control point, not the prism"  # why an observation must not be used
 
 # A control point is not a prism of the rig, so this reason is never replaced by later findings about prisms.
@@ -218,7 +222,7 @@ def stations_of(source: RowSource, session_id: str) -> list[str]:
 
 
 def all_observations(source: RowSource, session_ids: Sequence[str] = ()) -> list[dict[str, Any]]:
-    """Return used and excluded observations of some or all sessions, oldest first; joints and signals as columns.
+    """Return OBSERVATION_COLUMNS of used and excluded observations, oldest first, with joints and signals as columns.
 
     Args:
         source: the store.
@@ -226,9 +230,7 @@ def all_observations(source: RowSource, session_ids: Sequence[str] = ()) -> list
     """
     where = f"WHERE session_id IN ({marks(session_ids)})" if session_ids else ""
     rows = source.rows(
-        "SELECT session_id, setup_id, prism, pose, utc_ns, x_mm, y_mm, z_mm, sigma_x_mm, sigma_y_mm, sigma_z_mm, "
-        f"dwell_s, excluded, values_json FROM observations {where} ORDER BY id",
-        session_ids,
+        f"SELECT {', '.join(OBSERVATION_COLUMNS)}, values_json FROM observations {where} ORDER BY id", session_ids
     )
     return [{**row, **json.loads(row.pop("values_json"))} for row in rows]
 

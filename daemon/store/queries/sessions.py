@@ -21,6 +21,10 @@ from daemon.store.views import in_session
 from drivers.clock import NS_PER_S, Stamp
 
 # Why calibration does not use a session, a clause; NULL if it does. All queries of used sessions are made from this.
+SESSION_COLUMNS = (
+    *("id", "rig", "setup_id", "prism", "kind", "state", "operator", "note", "started_utc_ns", "ended_utc_ns"),
+    "not_used",
+)
 _NOT_USED = """CASE state WHEN 'open' THEN 'it is still open' WHEN 'aborted' THEN 'it was aborted' ELSE excluded END"""
 _USED = f"SELECT rowid AS number, * FROM calibration_sessions WHERE ({_NOT_USED}) IS NULL"
 BEFORE_NS = 60 * NS_PER_S  # dwell and direction of a session's first fixes depend on motion before it
@@ -366,13 +370,9 @@ def sessions_between(source: RowSource, since: Stamp, until: Stamp, boot: int) -
 
 
 def all_sessions(source: RowSource) -> list[dict[str, Any]]:
-    """Return every session without its rig file, oldest first, with `not_used`: None if calibration uses it."""
-    return list(
-        source.rows(
-            "SELECT id, rig, setup_id, prism, kind, state, operator, note, started_utc_ns, ended_utc_ns, "
-            f"{_NOT_USED} AS not_used FROM calibration_sessions ORDER BY rowid"
-        )
-    )
+    """Return SESSION_COLUMNS of every session, oldest first; `not_used` is None if calibration uses it."""
+    names = ", ".join(SESSION_COLUMNS[:-1])
+    return list(source.rows(f"SELECT {names}, {_NOT_USED} AS not_used FROM calibration_sessions ORDER BY rowid"))
 
 
 def sessions_of_use(source: RowSource) -> tuple[list[str], list[str]]:

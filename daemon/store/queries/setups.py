@@ -10,6 +10,7 @@ from typing import Any
 from daemon.store.connection import Connection
 from daemon.store.rows import RowSource, marks
 from drivers.clock import Stamp
+from drivers.readings import EventKind
 
 _OF_SESSIONS = """SELECT id, instrument, state FROM station_setups
     WHERE id IN (SELECT setup_id FROM calibration_sessions WHERE id IN ({})) ORDER BY rowid"""
@@ -37,6 +38,10 @@ _POINTS = """SELECT name, x_mm, y_mm, z_mm FROM control_points AS p WHERE setup_
         OR EXISTS (SELECT 1 FROM control_shots AS s JOIN calibration_sessions AS c ON c.id = s.session_id
             WHERE s.setup_id = ?1 AND s.name = p.name AND (c.state != 'aborted' OR c.id = ?2)))
     ORDER BY p.rowid"""
+# The number of the boot increases from boot to boot, and monotonic_ns within a boot; utc_ns may step.
+_SHOT_EVENTS = """SELECT kind, utc_ns, monotonic_ns, boot_id FROM device_events
+    WHERE device = ? AND kind IN ('shot_begun', 'shot_ended') AND (boot_id, monotonic_ns) >= (?, ?)
+    ORDER BY boot_id, monotonic_ns, id"""
 _POINT_SHOTS = """SELECT s.session_id, s.phase, s.misclosure_mm FROM control_shots AS s
     JOIN calibration_sessions AS c ON c.id = s.session_id
     WHERE s.setup_id = ? AND s.name = ? AND c.state != 'aborted'"""
@@ -120,6 +125,12 @@ class SetupTable:
     def mark_moved(self, setup_id: str) -> None:
         """Mark a set-up as moved: a control point is not where it was."""
         self._store.update("station_setups", {"id": setup_id}, {"state": "moved"})
+
+
+def shot_events(store: Connection, station: str, since: Stamp) -> list[tuple[EventKind, Stamp]]:
+    """Return when a station's shots of control points have begun and ended from an instant on, in order."""
+    rows = store.rows(_SHOT_EVENTS, (station, *store.order(since)))
+    return [(EventKind(row["kind"]), store.stamp(row)) for row in rows]
 
 
 # ---- for the writing connection and for readers ----------------------------------------------------------------------

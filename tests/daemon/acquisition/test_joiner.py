@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import random
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import pytest
@@ -312,6 +312,27 @@ def test_each_standstill_has_a_number_and_motion_has_none(journey: dict[float, J
     assert {number[t] for t in number if 6.4 < t < 7.5} == {2}
     assert {number[t] for t in number if 7.6 < t < 9.9} == {None}
     assert {number[t] for t in number if t > 10.4} == {3}
+
+
+@pytest.mark.parametrize("later_s", [0.3, 1.9, 2.4])
+def test_a_motion_that_is_read_late_is_a_motion_at_its_own_instant(later_s: float) -> None:
+    def turns(*times_s: tuple[float, float]) -> Callable[[float], float]:
+        return lambda t: sum(5.0 * min(max(t - start_s, 0.0), end_s - start_s) for start_s, end_s in times_s)
+
+    def joined(late_s: float) -> list[JoinedFix]:
+        arriving = [(fixes_ns(r), r) for r in samples(32.0, turns((22.2, 22.6), (27.0, 27.5)))]
+        late = samples(32.0, turns((19.0, 20.5), (25.4, 25.6)), name="theta8")
+        arriving += [(fixes_ns(r) + (late_s * 1e9 if fixes_ns(r) > 15e9 else 0.0), r) for r in late]
+        arriving += [(fixes_ns(r), r) for r in (fix(19.001 + n / 10) for n in range(60))]
+        joiner = ObservationJoiner((THETA, JointInput("theta8", "deg", 0.03)))
+        return [one for _, r in sorted(arriving, key=lambda item: item[0]) for one in joiner.feed([r])]
+
+    def stood(fixes: Sequence[JoinedFix]) -> list[tuple[float | None, int | None]]:
+        return [(one.dwell_s, one.standstill) for one in fixes]
+
+    in_time = joined(0.0)
+    assert {one.standstill for one in in_time} == {None, 2, 3}
+    assert stood(joined(later_s)) == stood(in_time)
 
 
 def test_noise_alone_is_no_motion() -> None:

@@ -18,6 +18,7 @@ import pytest
 from daemon.commands import CommandTurn, acting_for
 from daemon.control.server import ControlServer
 from daemon.store.queries.observations import OF_CONTROL_POINT
+from tests.daemon.support.acquisition import wait_until
 from tests.daemon.support.damage import fill_up, make_room
 from tests.daemon.support.sessions import STEP_S, Rig, disk_fails
 from tests.daemon.support.store import table
@@ -37,9 +38,10 @@ def shoot_without_storing_fixes(rig: Rig) -> dict[str, Any] | sqlite3.Error:
 
     asking = threading.Thread(target=ask)
     asking.start()
+    wait_until(lambda: rig.keeper._shot is not None or not asking.is_alive())
     while asking.is_alive():
         rig.clock.advance(STEP_S)
-        rig.keeper.on_records([rig.fix()])
+        rig.tell([rig.fix()])
     asking.join()
     return answers[0]
 
@@ -128,7 +130,7 @@ def tell_a_fix_of_the_far_future(rig: Rig) -> None:
     """Tell of a fix whose UTC no column can hold: acquisition could not store it either."""
     rig.clock.advance(STEP_S / 2)
     fix = rig.fix()
-    rig.keeper.on_records([replace(fix, stamp=replace(fix.stamp, utc_ns=2**63))])
+    rig.tell([replace(fix, stamp=replace(fix.stamp, utc_ns=2**63))])
 
 
 # ---- callers that leave ----------------------------------------------------------------------------------------------

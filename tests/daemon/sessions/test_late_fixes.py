@@ -34,7 +34,7 @@ def decode(rig: Rig, late: Sequence[Sequence[Record]]) -> None:
     rig.store.mark_decoded(rig.store.undecoded_chunks())
     for records in late:
         rig.store.insert_records(records)
-        rig.keeper.on_records(records)
+        rig.tell(records)
 
 
 def boot_with_an_earlier_clock(rig: Rig) -> None:

@@ -21,7 +21,7 @@ def jump(rig: Rig, device: str = "theta1", degrees: float = 8.2) -> None:
     if device in rig.values:
         rig.values[device] += degrees
     rig.store.insert_records([event])
-    rig.keeper.on_records([event])
+    rig.tell([event])
     rig.clock.advance(1.0)
 
 

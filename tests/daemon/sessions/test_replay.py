@@ -153,7 +153,13 @@ def live(
         first = ListLink("station", serial) if station_first else ListLink("boom", can)
         last = ListLink("boom", can, first.done) if station_first else ListLink("station", serial, first.done)
         acquisition = Acquisition(
-            [first, last], decoders(config, source), store, clock, batch_seconds=0.01, on_records=keeper.on_records
+            [first, last],
+            decoders(config, source),
+            store,
+            clock,
+            batch_seconds=0.01,
+            on_records=keeper.on_records,
+            also_store=keeper.pending.store,
         )
         acquisition.start()
         wait_until(first.done.is_set)

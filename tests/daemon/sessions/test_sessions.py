@@ -244,7 +244,7 @@ def test_after_an_encoder_jumped_nothing_of_the_session_is_used(rig: Rig) -> Non
     assert before is not None
     jump = DeviceEvent("theta1", rig.clock.now(), EventKind.PRESET_JUMP, "from 22 to 33")
     rig.store.insert_records([jump])
-    rig.keeper.on_records([jump])
+    rig.tell([jump])
     rig.values["theta1"] += 11.0
     rig.live(2)
     rig.keeper = rig.new_keeper()  # a new start of the daemon knows of it too
@@ -262,7 +262,7 @@ def test_a_jump_before_the_session_is_told_of_late_and_excludes_nothing(rig: Rig
     jumped = rig.clock.now()
     rig.live(1)
     start(rig)
-    rig.keeper.on_records([DeviceEvent("theta1", jumped, EventKind.PRESET_JUMP, "from 22 to 33")])
+    rig.tell([DeviceEvent("theta1", jumped, EventKind.PRESET_JUMP, "from 22 to 33")])
     rig.live(2)
     assert rig.say("stop")["observations"] > 10
 

@@ -102,8 +102,10 @@ class Rig:
                 self.tell(records)
 
     def tell(self, records: Sequence[Record]) -> None:
-        """Tell records that are stored to whoever takes them."""
+        """Tell records to whoever takes them; what comes of them is stored, or is pending while the disk fails."""
         self.keeper.on_records(records)
+        with contextlib.suppress(sqlite3.OperationalError):
+            self.keeper.pending.store()
 
     def fix(self) -> Fix:
         east, north, up = (v / 1000 for v in self.target_mm)
