@@ -91,7 +91,7 @@ def test_a_prism_that_an_operator_confirms_counts_from_then_on(rig: Rig) -> None
     assert answer["text"] == "Ada confirms that the station is on prism r; its fixes are used from now on"
     assert [s["distance_m"] for s in answer["ended"]] == [pytest.approx(10.0)]
     (advice,) = answer["advice"]
-    assert "if it was on another prism then, abort the session" in advice
+    assert "if it was on another prism then, reject the session after its end: `rigcal session reject" in advice
     assert rig.keeper.prism_suspicions() == []
     rig.values["theta1"] += 5  # the next standstill: within one, the most fixes decide
     rig.live(5)
