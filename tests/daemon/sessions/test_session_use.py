@@ -70,7 +70,7 @@ def test_a_station_that_moved_is_not_taken_for_where_it_stood_before(session_rig
         session_rig.say("start", prism="r")
     assert caught.value.status == 3
     assert str(caught.value) == (
-        "the current set-up 'S2' has moved; describe a new one with `rigcal setup new`, or name an earlier one "
+        "the current set-up 'S2' has moved; describe a new one with `rigcal setup new`, or name another one "
         "with --setup if the station stands there again"
     )
     assert session_rig.setups.current() is None, "nor does the live tip"
