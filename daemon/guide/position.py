@@ -14,8 +14,7 @@ from calibration.rig.description import Rig
 from calibration.rig.limits import on_one_turn
 from daemon.acquisition.joiner import MachineState, ObservationJoiner
 from daemon.guide.job import Pose
-from daemon.sessions.open_session import CONTROL_POINT_RADIUS_MM
-from daemon.sessions.station_setups import Place
+from daemon.sessions.station_setups import CONTROL_POINT_RADIUS_MM, Place
 from daemon.store.queries.guides import Standstill
 from drivers.clock import NS_PER_S, Clock
 from drivers.readings import Fix, Record

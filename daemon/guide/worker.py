@@ -21,8 +21,7 @@ from daemon.guide.record import GuideStep
 from daemon.guide.request import misfit
 from daemon.host.worker_thread import WorkerThread
 from daemon.sessions.manager import SessionManager
-from daemon.sessions.open_session import CONTROL_POINT_RADIUS_MM
-from daemon.sessions.station_setups import StationSetups
+from daemon.sessions.station_setups import CONTROL_POINT_RADIUS_MM, StationSetups
 from drivers.clock import NS_PER_S, Clock
 
 log = logging.getLogger(__name__)

@@ -32,11 +32,11 @@ from daemon.sessions.advice import SessionAdvice, after_a_move
 from daemon.sessions.control_shot import Shot
 from daemon.sessions.lifecycle import SessionLifecycle
 from daemon.sessions.observing import ObservationMaker, PendingWrites
-from daemon.sessions.open_session import CONTROL_POINT_RADIUS_MM, OpenSession
+from daemon.sessions.open_session import OpenSession
 from daemon.sessions.prism_watch import PrismWatch, as_dict
 from daemon.sessions.prisms.guard import MotionLimit, Suspicion
 from daemon.sessions.shot_times import ShotTimes
-from daemon.sessions.station_setups import StationSetups
+from daemon.sessions.station_setups import CONTROL_POINT_RADIUS_MM, StationSetups
 from daemon.sessions.without_job import why_no_job
 from daemon.store.queries.jobs import JobTable
 from daemon.store.queries.observations import ObservationTable, first_constants_mm

@@ -8,11 +8,10 @@ from dataclasses import dataclass, field
 from daemon.sessions.control_shot import Shot
 from daemon.sessions.prisms.evidence import PrismEvidence
 from daemon.sessions.prisms.guard import OperatorConfirmation, PrismGuard
-from daemon.sessions.station_setups import Place
+from daemon.sessions.station_setups import CONTROL_POINT_RADIUS_MM, Place
 from drivers.clock import Order, Stamp, lies_within
 
 CONSTANT_TOLERANCE_MM = 0.05  # tolerance of a prism constant, which stations hold in steps of 0.1 mm
-CONTROL_POINT_RADIUS_MM = 300.0  # a fix this close to a control point is of the control point, not of the boom
 
 
 @dataclass

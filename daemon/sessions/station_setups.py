@@ -29,6 +29,7 @@ log = logging.getLogger(__name__)
 
 Place = tuple[float, float, float]
 MOST_CONSTANT_MM = 500.0
+CONTROL_POINT_RADIUS_MM = 300.0  # a target this close to a control point is that point, not the boom or another point
 AXES = ("x_mm", "y_mm", "z_mm")
 
 
@@ -166,7 +167,15 @@ class StationSetups:
         known = self._known_place(setup_id, session_id, name, phase)
         place = {axis: fmean(p[i] for p in places_mm) for i, axis in enumerate(AXES)}
         reference = known or place
-        distance_mm = math.dist([*place.values()], [reference[axis] for axis in AXES])
+        distance_mm = _distance_mm(place, reference)
+        if known is None or distance_mm >= CONTROL_POINT_RADIUS_MM:
+            for other in control_points(self._store, setup_id, session_id):
+                if other["name"] != name and _distance_mm(place, other) < CONTROL_POINT_RADIUS_MM:
+                    raise CommandError(
+                        f"the station is on control point {other['name']}, not on {name}, and nothing was stored: aim "
+                        f"at {name} and measure again",
+                        REFUSED,
+                    )
         if distance_mm > most_off_mm:
             raise CommandError(
                 f"the station's target is {distance_mm / 1e3:.1f} m from control point {name}, and nothing was stored: "
@@ -221,6 +230,10 @@ class StationSetups:
     def control_points(self, setup_id: str, session_id: str) -> list[Place]:
         """Return the places of the control points that a session in a set-up knows, mm in the station's frame."""
         return [(p["x_mm"], p["y_mm"], p["z_mm"]) for p in control_points(self._store, setup_id, session_id)]
+
+
+def _distance_mm(one: Mapping[str, Any], other: Mapping[str, Any]) -> float:
+    return math.dist([one[axis] for axis in AXES], [other[axis] for axis in AXES])
 
 
 def _place(name: object, place: object) -> dict[str, float]:

@@ -111,6 +111,18 @@ def test_a_control_point_that_is_not_there_is_told(rig: Rig) -> None:
         rig.say("shoot", point="r")
 
 
+def test_a_control_point_is_not_defined_or_measured_where_another_one_is(rig: Rig) -> None:
+    start(rig)
+    rig.shoot("cp1", (9000.0, 500.0, 2000.0))
+    with pytest.raises(CommandError, match="the station is on control point cp1, not on cp2, and nothing was stored"):
+        rig.shoot("cp2", (9000.0, 500.0, 2000.0))
+    rig.shoot("cp2", (9000.0, 5000.0, 2000.0))
+    rig.live(2)
+    with pytest.raises(CommandError, match="on control point cp2, not on cp1"):
+        rig.shoot("cp1", (9000.0, 5000.0, 2000.0))
+    assert not rig.shoot("cp1", (9000.0, 500.0, 2000.0))["moved"]
+
+
 def test_a_shot_that_the_operator_gave_up_measures_nothing(rig: Rig, tmp_path: Path) -> None:
     """Who gives up turns the station back to the prism, whose fixes were then taken for the control point."""
     start(rig)

@@ -21,6 +21,7 @@ from tests.daemon.support.sessions import SOURCE, Rig, controlled
 
 CP1 = (9000.0, 500.0, 2000.0)
 ELSEWHERE = (9000.0, 520.0, 2000.0)
+CP2 = (9000.0, 4000.0, 2000.0)
 
 
 def uncontrolled(rig: Rig, kind: str = "static_poses") -> str:
@@ -159,10 +160,10 @@ def test_a_point_that_is_shot_later_does_not_vouch_for_the_poses_before_it(sessi
     session_rig.live(2)
     session_rig.live(1, theta1=3.0)  # another pose, and meanwhile the station is carried elsewhere
     session_rig.live(2)
-    session_rig.shoot("cp2", ELSEWHERE)
+    session_rig.shoot("cp2", CP2)
     session_rig.live(1, theta1=3.0)
     session_rig.live(4)
-    session_rig.shoot("cp2", ELSEWHERE)
+    session_rig.shoot("cp2", CP2)
     name = session_rig.say("stop")["id"]
     assert session_rig.say("show", id=name)["not_used"].startswith(
         "the control point shot at the session's start was not"
