@@ -46,6 +46,7 @@ UNGUARDED = (
     "guide.skip",
     "guide.more",
     "guide.stop",
+    "jobs.cancel",
     "alarms.test-notice",
     "devices.configure",
     "simulation.visit",

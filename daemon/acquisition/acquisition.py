@@ -293,7 +293,7 @@ class Acquisition:
             records += self._decoding.tick(now)
             self._next_tick_ns = now.monotonic_ns + TICK_NS
             until = now
-        self._decoded = _Decoded(batch.chunk_ids, records, [*batch.reports, *records], until)
+        self._decoded = _Decoded(batch.chunk_ids, self._kept(records), [*batch.reports, *records], until)
         self._hand_on(self._decoded.told)
 
     def _tell_of_left_overs(self, *, is_left_over: bool) -> None:
@@ -344,9 +344,9 @@ class Acquisition:
             self._board.captured(batch.captures)
             tell_of_links(batch.reports)
             records = self._decoding.feed_and_tick(batch.captures)
-            told = [*batch.reports, *records]
+            kept, told = self._kept(records), [*batch.reports, *records]
             self._hand_on(told)
-            self._commit_records(records, batch.chunk_ids)
+            self._commit_records(kept, batch.chunk_ids)
             self._board.recorded(told, _end(batch.captures))
 
     # ---- the writer's work -----------------------------------------------------------------------------------------
@@ -366,10 +366,13 @@ class Acquisition:
                 batches.append(Batch(self._store.append_captures(captures), captures, reports))
         return batches
 
+    def _kept(self, records: Sequence[Record]) -> Sequence[Record]:
+        """Return the records to store; asked once, and before consumers see them, who may then end a session."""
+        return records if self._thinning is None else self._thinning.kept(records)
+
     def _commit_records(self, records: Sequence[Record], chunk_ids: Sequence[int]) -> None:
-        kept = records if self._thinning is None else self._thinning.kept(records)
         with self._store.transaction():
-            self._insert(kept)
+            self._insert(records)
             self._store.mark_decoded(chunk_ids)
             self._also_store()
 

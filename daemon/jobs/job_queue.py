@@ -181,7 +181,7 @@ class JobQueue:
         """Mark a queued job as running and clear what earlier runs left; return False if it does not run.
 
         It does not if it is no longer queued. It is cancelled if an operator has rejected a session on which its model
-        was trained, and in a chain also if such a session is not used any more for another reason.
+        was trained.
 
         Args:
             job: the job.
@@ -217,7 +217,7 @@ class JobQueue:
         model = self._model_of(row)
         if model is None:
             return None
-        unused = self._models.not_used(model.sessions, only_if_rejected=row["depends_on"] is None)
+        unused = self._models.not_used(model.sessions, only_if_rejected=True)
         if unused is None:
             return None
         return f"session {unused[0]}, on which its model was trained, is not used any more: {unused[1]}"

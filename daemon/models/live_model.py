@@ -97,6 +97,7 @@ class LiveModel(WorkerThread):
         self._turn = threading.Lock()  # guards the state together with the mark that it is out of date
         self._changed = threading.Event()
         self._changed.set()
+        self._is_void = False
         self._told = ""  # the last load error that was logged
 
     def stop(self) -> None:
@@ -127,8 +128,13 @@ class LiveModel(WorkerThread):
     def changed(self) -> None:
         """Load again, because a different model has gone live or what is known of the joints' zeros has changed."""
         with self._turn:
-            self._state = Missing(LOADING)
+            self._state, self._is_void = Missing(LOADING), False
             self._changed.set()
+
+    def void(self) -> None:
+        """Use the model no more until `changed` is called, because what will change is not stored yet."""
+        with self._turn:
+            self._state, self._is_void = Missing(LOADING), True
 
     def load(self, row: ModelRow) -> CalibratedModel:
         """Read a model of the store; a child process loaded it successfully when it was written.
@@ -157,7 +163,7 @@ class LiveModel(WorkerThread):
             state = self._look()
             wait_s = RETRY_S if isinstance(state, Missing) and state.is_defect else None
             with self._turn:
-                if not self._changed.is_set():
+                if not self._changed.is_set() and not self._is_void:
                     self._state = state
 
     def _look(self) -> Loaded | Missing:

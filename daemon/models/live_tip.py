@@ -111,12 +111,23 @@ class LiveTip:
         self._is_failing = False
 
     def on_records(self, records: Sequence[Record]) -> None:
-        """Note the joiner's state, which includes these records already; cheap while no model is live."""
-        joints = self._rig.joint_names
-        if any(isinstance(r, DeviceEvent) and r.kind is EventKind.PRESET_JUMP and r.device in joints for r in records):
-            self._model.changed()  # the jump is in the store already
+        """Note the joiner's state, which includes these records already; cheap while no model is live.
+
+        Where a joint has jumped there is no tip until the model is loaded again (`LiveModel.changed`), which must wait
+        until the jump is stored.
+        """
+        if self.has_jumped(records):
+            self._model.void()
         if isinstance(self._model.now(), Loaded):
             self._state = self._joiner.latest()
+
+    def has_jumped(self, records: Sequence[Record]) -> bool:
+        """Return True if a joint's encoder has jumped."""
+        joints = self._rig.joint_names
+        return any(
+            isinstance(one, DeviceEvent) and one.kind is EventKind.PRESET_JUMP and one.device in joints
+            for one in records
+        )
 
     def tip_command(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
         """Return the present position of a prism, by default the configured one."""

@@ -291,7 +291,7 @@ class SessionLifecycle:
             self._decide(session_id, operator, "rejected", instead_of="accepted")
             self.table.change(session_id, rejected_reason=reason, accepted_despite=None)
             has_drift = self._models.forget_drift(session_id)
-            if excluded is None or has_drift:
+            if excluded is None or has_drift or _has_other_readings({"excluded": excluded}):  # it was used before
                 self.table.change(session_id, accepted_after_job=self._jobs.newest_id())
             excluded = self._why_not_used(session_id)
             self.table.change(session_id, excluded=excluded)

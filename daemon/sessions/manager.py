@@ -102,7 +102,7 @@ class SessionManager:
         self.pending = PendingWrites(store)
         self._prisms = PrismWatch(store, rig, clock, limits, self.pending.add_event)
         self._observing = ObservationMaker(rig, store, self._observations, self.pending, self._prisms, run_id)
-        self._shot_times = ShotTimes(store, clock, limits, aim, self._prisms.turned)
+        self._shot_times = ShotTimes(store, clock, limits, aim, self._prisms.turned, self.pending.add)
         self._advice = SessionAdvice(rig, setups, self._table, self._prisms)
         self._late: set[str] = set()  # sessions that got fixes after their end, and must be judged again
         # Fixes measured in ended sessions may still arrive, or wait for their joints
@@ -115,6 +115,7 @@ class SessionManager:
     def on_records(self, records: Sequence[Record]) -> None:
         """Process records that are about to be stored: complete a shot, or make observations of the open session."""
         has_jumped = False
+        self._judge_again(records)
         for record in records:
             if isinstance(record, Fix):
                 if (shot := self._shot) is not None:  # a shot names its fixes, which must be stored before
@@ -139,11 +140,16 @@ class SessionManager:
         """Return True if an instant lies in the open session, or in an ended one that may still get fixes."""
         return any(session.lasted(stamp) for session in self._taking())
 
+    def _judge_again(self, records: Sequence[Record]) -> None:
+        """Judge sessions again of which more has become known, while all fixes before these records are stored."""
+        for session in self._taking():
+            first = next((r.stamp for r in records if isinstance(r, Fix) and session.lasted(r.stamp)), None)
+            if first is not None and self._prisms.is_judged_again(session, first):
+                self._observing.restore(session)
+
     def _watch_prism(self, fix: Fix) -> None:
         for session in self._taking():
             if session.lasted(fix.stamp):
-                if self._prisms.is_judged_again(session, fix.stamp):
-                    self._observing.restore(session)
                 self._prisms.see(session, fix)
 
     def _taking(self) -> list[OpenSession]:

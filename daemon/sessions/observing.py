@@ -67,10 +67,13 @@ class PendingWrites:
         Raises:
             sqlite3.DatabaseError: the store cannot be written at present.
         """
-        if self._writes:
+        if writes := [*self._writes]:
             with self._store.transaction():
-                self._store.once_committed(self._writes.clear)
-                self._make(self._writes)
+                self._store.once_committed(partial(self._drop, len(writes)))
+                self._make(writes)
+
+    def _drop(self, made: int) -> None:
+        del self._writes[:made]  # others may have been added meanwhile
 
     def _make(self, writes: Sequence[Callable[[], object]]) -> None:
         """Make changes; a change that can never be made does not block the others."""

@@ -30,6 +30,7 @@ class ShotTimes:
         stations: names of the configured stations.
         aim: turns the station to a prism or control point; None where the operator does it.
         turned: called with a session and the instant at which `aim` has turned the station back to its prism.
+        later: takes a change that the store has refused, and makes it as soon as the store can be written.
     """
 
     def __init__(
@@ -39,8 +40,10 @@ class ShotTimes:
         stations: Collection[str],
         aim: Callable[[str], None] | None,
         turned: Callable[[OpenSession, Stamp], None],
+        later: Callable[[Callable[[], object]], None],
     ) -> None:
         self._store, self._clock, self._stations, self._aim, self._turned = store, clock, stations, aim, turned
+        self._later = later
 
     @contextmanager
     def on_point(self, session: OpenSession, point: str, wanted: int) -> Iterator[Shot]:
@@ -71,16 +74,21 @@ class ShotTimes:
         self._store.insert_records([DeviceEvent(station, at, kind, text) for station in self._stations])
 
     def _note_end(self, session: OpenSession, point: str, at: Stamp) -> None:
-        """Store the end of a shot, and that a program turned the station, if one does; log it if this is refused."""
-        try:
+        """Store the end of a shot, and that a program turned the station, if one does; later if the disk refuses it."""
+
+        def note() -> None:
             with self._store.transaction():
                 self._note(EventKind.SHOT_ENDED, at, f"shot of control point {point} ended")
                 if self._aim is not None:
                     self._turned(session, at)
+
+        try:
+            note()
         except sqlite3.Error as error:
             if not is_unwritable(error):
                 raise
-            log.warning("the turn of the station to prism %s could not be stored: %s", session.prism, error)
+            log.warning("the end of a shot of control point %s will be stored later: %s", point, error)
+            self._later(note)
 
     def cut_off(self, session: OpenSession) -> Stamp | None:
         """Return the start of a shot of a session that the end of an earlier run cut off; None without one."""

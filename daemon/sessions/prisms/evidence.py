@@ -285,21 +285,27 @@ class PrismEvidence:
         asked = list(stretches)
         for _ in range(3):
             news = [finding for stretch in asked for finding in self._judge_as_one(identity, [stretch])]
-            unsure = [s for s in self._stretches if not s.is_sure and not s.is_believed]
-            if len(unsure) > 1:
-                news += self._judge_as_one(identity, unsure)
-            if not news:
-                news += self._judge_as_one(identity, self._most(identity, unsure))
+            news += self._judge_together(identity)
             found += news
             if not news:
                 break
             asked = self._stretches
         return list({id(finding.stretch): finding for finding in found}.values())
 
+    def _judge_together(self, identity: PrismIdentity) -> list[Finding]:
+        """Judge together the stretches that are too short alone: all, those that fit each other, the suspected ones."""
+        unsure = [s for s in self._stretches if not s.is_sure and not s.is_believed]
+        if len(unsure) < 2:
+            return []
+        if news := self._judge_as_one(identity, unsure):
+            return news
+        most = self._most(identity, unsure)
+        return self._judge_as_one(identity, most) or self._judge_as_one(identity, [s for s in most if s.is_doubted])
+
     def _most(self, identity: PrismIdentity, stretches: Sequence[Stretch]) -> Sequence[Stretch]:
         """Return the stretches that fit each other as the session's prism; none unless they are most of them."""
         kept = self._fitting(identity, [_some(stretch.sightings) for stretch in stretches])
-        return [stretches[index] for index in kept] if len(stretches) <= 2 * len(kept) < 2 * len(stretches) else []
+        return [stretches[index] for index in kept] if 2 * len(kept) >= len(stretches) else []
 
     def _judge_as_one(
         self, identity: PrismIdentity, judged: Sequence[Stretch], beside: Sequence[Stretch] = ()
@@ -328,9 +334,9 @@ class PrismEvidence:
             alone = identity.misfits(targets(self._rig, []), own)
             if (by_itself := self._verdict(alone, 0, poses)) is not Verdict.OPEN:
                 misfits, verdict, is_sure = alone, by_itself, True
+        is_sure = is_sure or (others > 0 and others + poses > STRONG and verdict is Verdict.NAMED)
         is_new_doubt = verdict is Verdict.OTHER or not judged[0].is_doubted
-        suffices = len(judged) == 1 and (is_new_doubt or (others > 0 and others + poses > STRONG))
-        if not is_sure and not suffices:
+        if not is_sure and not (len(judged) == 1 and is_new_doubt):
             return []
         if len(judged) > 1 and verdict is Verdict.NAMED:  # most are of the prism; each must also fit by itself
             return [finding for stretch in judged for finding in self._judge_as_one(identity, [stretch], judged)]

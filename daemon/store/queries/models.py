@@ -248,13 +248,14 @@ class ModelTable:
 
         Returns:
             False, with nothing changed, if a different model is live by now, or the model was compared again or has
-            changed its state since, or a session on which a candidate was trained is not used any more.
+            changed its state since, or a session on which a candidate was trained or compared is not used any more.
         """
         with self._store.transaction():
             now_live = self.live()
             if self.get(model.id) != model or (now_live and now_live.id) != (replaced and replaced.id):
                 return False
-            if model.state == "candidate" and self.not_used(model.sessions) is not None:
+            checks = (model.comparison or {}).get("sessions", ())
+            if model.state == "candidate" and self.not_used((*model.sessions, *checks)) is not None:
                 return False
             if replaced is not None:
                 self._store.update("models", {"id": replaced.id}, {"state": "retired"})

@@ -2,10 +2,20 @@
 
 from __future__ import annotations
 
+import sqlite3
+from collections.abc import Callable
+from pathlib import Path
+from threading import Event
+
+import pytest
+
+from daemon.acquisition.acquisition import Acquisition
 from daemon.acquisition.thinning import Thinning
-from drivers.clock import NS_PER_S, Stamp
-from drivers.readings import DecodeFailure, Reading, Record, Status
-from tests.daemon.support.store import at, fix, reading
+from daemon.store.store import Store
+from drivers.clock import NS_PER_S, Stamp, SystemClock
+from drivers.readings import CanCapture, DecodeFailure, LinkItem, Reading, Record, Status
+from tests.daemon.support.acquisition import wait_until
+from tests.daemon.support.store import at, fix, reading, table
 
 
 def outside(_: Stamp) -> bool:
@@ -42,3 +52,57 @@ def test_a_change_of_status_another_boot_and_all_that_is_no_reading_are_kept() -
     rebooted = Reading("theta1", Stamp(1, 1, "another"), 1.0, "deg")
     records = [reading("theta1", 0.0, 1.0), reading("theta1", 0.01, 1.0), alarm, failure, again, rebooted]
     assert Thinning(outside).kept(records) == [records[0], alarm, failure, again, rebooted]
+
+
+def test_a_change_of_status_whose_first_commit_is_refused_is_stored_later(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One reading of an alarm amid many good ones, of which one a second is stored."""
+    monkeypatch.setattr("daemon.acquisition.acquisition.RETRY_S", 0.02)
+    store, clock = Store(tmp_path / "rigcal.sqlite"), SystemClock()
+    store.begin_run(clock.now())
+    store.declare_channels({"theta1": "deg"}, {})
+    alarm, captures, refusals = 15, 30, iter([True])
+
+    class Link:
+        name, read_until = "boom", None
+
+        def run(self, emit: Callable[[LinkItem], None], stop: Event) -> None:
+            for number in range(captures):
+                emit(CanCapture("boom", clock.now(), 0x181, bytes([number])))
+                stop.wait(0.02)
+            stop.wait()
+
+    class Alarmed:
+        def feed(self, capture: CanCapture) -> list[Record]:
+            is_bad = capture.data[0] == alarm
+            status = Status.DEVICE_ALARM if is_bad else Status.OK
+            return [Reading("theta1", capture.stamp, None if is_bad else 1.0, "deg", status)]
+
+        def tick(self, now: object) -> list[Record]:
+            return []
+
+    seen: list[Record] = []
+
+    def refuse_once() -> None:
+        if any(isinstance(r, Reading) and r.status is Status.DEVICE_ALARM for r in seen) and next(refusals, False):
+            error = sqlite3.OperationalError("database is locked")
+            error.sqlite_errorcode, error.sqlite_errorname = sqlite3.SQLITE_BUSY, "SQLITE_BUSY"
+            raise error
+
+    acquisition = Acquisition(
+        [Link()],
+        {"boom": Alarmed},
+        store,
+        clock,
+        on_records=seen.extend,
+        also_store=refuse_once,
+        thinning=Thinning(lambda _: False),
+    )
+    acquisition.start()
+    wait_until(lambda: len([r for r in seen if isinstance(r, Reading)]) == captures)
+    assert acquisition.stop()
+    statuses = [row["status"] for row in table(store.path, "joint_samples")]
+    store.close()
+    assert next(refusals, None) is None, "the disk has refused once"
+    assert "device_alarm" in statuses

@@ -13,6 +13,7 @@ from daemon.cli.lines.state import model_lines
 from daemon.commands import CHECK, CommandError
 from daemon.next_step import next_line
 from daemon.sessions.lifecycle import SessionLifecycle
+from daemon.store.queries.models import ModelRow
 from tests.daemon.support.jobs import SOURCE
 from tests.daemon.support.models import PRISMS, ModelRig
 
@@ -173,6 +174,24 @@ def test_a_model_whose_only_check_was_rejected_waits_for_another_check(rig: Mode
     step = next_line(status | {"models": rig.registry.status()})
     assert "hold a check session" in step
     assert "other prisms" not in step
+
+
+@pytest.mark.long
+def test_a_check_that_is_rejected_while_the_model_is_loaded_keeps_it_from_going_live(
+    rig: ModelRig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = compared_on_check(rig)
+    load, rejections = rig.live.load, iter(["c"])
+
+    def loading(row: ModelRow) -> object:
+        for session in rejections:
+            rejected(rig, session)
+        return load(row)
+
+    monkeypatch.setattr(rig.live, "load", loading)
+    with pytest.raises(CommandError, match="models or sessions were changed in the meantime"):
+        rig.registry.accept_command({"id": model})
+    assert rig.models.live() is None
 
 
 @pytest.mark.long

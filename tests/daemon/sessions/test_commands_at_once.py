@@ -99,12 +99,14 @@ def test_a_shot_is_answered_where_it_cannot_be_stored_that_the_station_was_turne
     answer = shoot_without_storing_fixes(session_rig)
     assert isinstance(answer, dict)
     assert answer["point"] == "cp1"
-    assert "the turn of the station to prism r could not be stored" in caplog.text
+    assert "the end of a shot of control point cp1 will be stored later" in caplog.text
     assert len(table(session_rig.store.path, "control_shots")) == 1
     make_room(session_rig.store)
     session_rig.target_mm = prism_mm
     session_rig.live(2)
     assert session_rig.say("show", id="s001-r")["observations"] > 10, "its fixes are its observations again"
+    kinds = [row["kind"] for row in table(session_rig.store.path, "device_events")]
+    assert kinds.count("shot_begun") == kinds.count("shot_ended") == 1, "a restart knows that the shot has ended"
 
 
 def test_an_observation_that_can_never_be_stored_takes_none_of_those_that_wait_with_it(

@@ -11,6 +11,7 @@ import pytest
 
 from daemon.acquisition import acquisition as acquisition_module
 from daemon.acquisition.acquisition import Acquisition
+from daemon.acquisition.thinning import Thinning
 from drivers.readings import CanCapture, Capture, Reading, Record
 from tests.daemon.support.acquisition import wait_until
 from tests.daemon.support.damage import fill_up, make_room
@@ -19,6 +20,40 @@ from tests.daemon.support.store import table
 
 POINT_MM = (9000.0, 500.0, 2000.0)
 WAITED = range(10, 20)  # the last half second of the first batch: its fixes waited for readings of the second one
+
+
+def test_a_session_whose_end_is_decoded_with_what_came_a_minute_later_keeps_its_fixes(session_rig: Rig) -> None:
+    session_rig.say("start", prism="r")
+    measured: list[list[Record]] = []
+
+    def measure(instants: int) -> None:
+        for _ in range(instants):
+            session_rig.clock.advance(STEP_S)
+            now = session_rig.clock.now()
+            session_rig.store.append_captures([CanCapture("boom", now, 0x181, len(measured).to_bytes(2, "little"))])
+            joints = [Reading(j.name, now, session_rig.values[j.name], j.unit) for j in SOURCE.rig.joints]
+            measured.append([*joints, session_rig.fix()])
+
+    measure(100)
+    session_rig.say("stop")
+    measure(1400)
+    session_rig.keeper = session_rig.new_keeper()
+    acquisition = Acquisition(
+        [],
+        {"boom": lambda: Measured(measured)},
+        session_rig.store,
+        session_rig.clock,
+        batch_seconds=0.01,
+        on_records=session_rig.keeper.on_records,
+        also_store=session_rig.keeper.pending.store,
+        thinning=Thinning(session_rig.keeper.is_of_session),
+    )
+    acquisition.start()
+    wait_until(lambda: not session_rig.store.undecoded_chunks())
+    assert acquisition.stop()
+    observed = table(session_rig.store.path, "observations")
+    assert len(observed) >= 99
+    assert all(row["fix_id"] is not None for row in observed)
 
 
 class Measured:

@@ -140,10 +140,12 @@ class ModelRig:
         )
 
     def take(self, records: Sequence[Record]) -> None:
-        """Store records and hand them on, as the writer does."""
-        self.store.insert_records(records)
+        """Hand records on and store them, as the writer does."""
         self.joiner.feed(records)
         self.tip.on_records(records)
+        self.store.insert_records(records)
+        if self.tip.has_jumped(records):
+            self.live.changed()
 
 
 def wait(done: Callable[[], bool]) -> None:

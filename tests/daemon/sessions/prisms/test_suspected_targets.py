@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import itertools
 import resource
 
+import numpy as np
 import pytest
 
-from drivers.readings import EventKind
-from tests.daemon.sessions.prisms.test_prism_evidence import TrueRig, texts
+from daemon.sessions.open_session import OpenSession
+from drivers.readings import EventKind, Fix, Reading, Record
+from tests.daemon.sessions.prisms.test_prism_evidence import RIG, TrueRig, place_mm, texts
 from tests.daemon.support.sessions import STEP_S, closed_afterwards
+from tests.daemon.support.store import table
 
 rig = closed_afterwards(TrueRig)
 CONTROL_MM = (9000.0, 500.0, 2000.0)
@@ -94,6 +98,59 @@ def test_another_prism_of_the_machine_stays_suspected_at_whatever_pose_it_is_fou
         rig.live(2.0)
         assert len(rig.keeper.prism_suspicions()) == 1
         assert rig.used(session) <= of_the_prism
+
+
+@pytest.mark.parametrize(("target", "seed"), [("b", 2), ("s", 22), ("w", 23)])
+def test_the_prism_counts_again_at_other_poses_that_tell_prisms_apart_only_with_what_was_seen_before(
+    rig: TrueRig, target: str, seed: int
+) -> None:
+    half = np.array([(joint.limits[1] - joint.limits[0]) / 2 for joint in RIG.joints])
+    middle = np.array([sum(joint.limits) / 2 for joint in RIG.joints])
+    poses = middle + np.random.default_rng(seed).uniform(-0.09, 0.09, (9, len(half))) * half
+    session = rig.say("start", prism="r")["id"]
+    for pose, seen in zip(poses, ["r", target, target, *["r"] * 6], strict=True):
+        pause(rig, 3.0)
+        rig.values = dict(zip(RIG.joint_names, map(float, pose), strict=True))
+        rig.target_mm = place_mm(seen, rig.values)
+        rig.live(2.0)
+    assert rig.keeper.prism_suspicions() == []
+    assert rig.used(session) > 7 * 25
+
+
+@pytest.mark.parametrize("off_mm", [450.0, 1500.0, 12_000.0])
+def test_a_point_that_is_located_while_many_fixes_are_judged_ends_no_suspicion(rig: TrueRig, off_mm: float) -> None:
+    def measured(fixes: int) -> list[Record]:
+        records: list[Record] = []
+        for _ in range(fixes):
+            rig.clock.advance(STEP_S)
+            now = rig.clock.now()
+            records += [Reading(joint.name, now, rig.values[joint.name], joint.unit) for joint in RIG.joints]
+            records.append(rig.fix())
+        return records
+
+    def keep(records: list[Record]) -> None:
+        rig.tell(records)
+        rig.store.insert_records(records)
+
+    rig.say("start", prism="r")
+    keep(measured(40))
+    x, y, z = rig.target_mm
+    rig.target_mm = (x + off_mm, y, z)
+    (opened,) = rig.keeper._taking()
+    see, seen = rig.keeper._prisms.see, itertools.count()
+
+    def seeing(session: OpenSession, fix: Fix) -> None:
+        see(session, fix)
+        if next(seen) == 20:
+            opened.know([(20_000.0, 20_000.0, 0.0)], opened.constants_mm)  # as a shot does in another thread
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(rig.keeper._prisms, "see", seeing)
+        keep(measured(40))
+    keep(measured(20))
+    used = [row["x_mm"] for row in table(rig.store.path, "observations") if row["excluded"] is None]
+    assert len(used) >= 30
+    assert max(used) - min(used) < 1.0, "of the prism alone"
 
 
 def test_a_session_that_cannot_be_judged_again_for_lack_of_descriptors_keeps_its_suspicions(rig: TrueRig) -> None:
