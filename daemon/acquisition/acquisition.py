@@ -101,7 +101,8 @@ class Acquisition:
         thinning: Thinning | None = None,
     ) -> None:
         self._store, self._clock, self._on_records, self._also_store = store, clock, on_records, also_store
-        self._thinning = thinning
+        # Asked once for each batch, and before consumers see it, who may then end a session.
+        self._kept: Callable[[Sequence[Record]], Sequence[Record]] = list if thinning is None else thinning.kept
         self._batch_seconds = batch_seconds
         self._intakes = [LinkIntake(link, clock, queue_captures, store.begun or clock.now()) for link in links]
         self._factories = decoders
@@ -365,10 +366,6 @@ class Acquisition:
                 self._insert(reports)
                 batches.append(Batch(self._store.append_captures(captures), captures, reports))
         return batches
-
-    def _kept(self, records: Sequence[Record]) -> Sequence[Record]:
-        """Return the records to store; asked once, and before consumers see them, who may then end a session."""
-        return records if self._thinning is None else self._thinning.kept(records)
 
     def _commit_records(self, records: Sequence[Record], chunk_ids: Sequence[int]) -> None:
         with self._store.transaction():

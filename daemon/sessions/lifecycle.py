@@ -208,7 +208,7 @@ class SessionLifecycle:
     def _judge_readings(self, closed: Mapping[str, Any]) -> None:
         session_id, excluded = closed["id"], closed["excluded"]
         why = self._why_other_readings(self._row(session_id))
-        if why is None and not _has_other_readings(closed):
+        if why is None and not _has_other_readings(excluded):
             return
         if closed["accepted_despite"] is None:
             why = self._why_not_used(session_id)
@@ -291,7 +291,7 @@ class SessionLifecycle:
             self._decide(session_id, operator, "rejected", instead_of="accepted")
             self.table.change(session_id, rejected_reason=reason, accepted_despite=None)
             has_drift = self._models.forget_drift(session_id)
-            if excluded is None or has_drift or _has_other_readings({"excluded": excluded}):  # it was used before
+            if excluded is None or has_drift or _has_other_readings(excluded):  # it was used before
                 self.table.change(session_id, accepted_after_job=self._jobs.newest_id())
             excluded = self._why_not_used(session_id)
             self.table.change(session_id, excluded=excluded)
@@ -369,6 +369,6 @@ def _why_left_open(row: Mapping[str, Any]) -> str | None:
     return next((reason for reason in reasons if reason.startswith((OPEN_AT_NEXT, OPEN_IN_BACKUP))), None)
 
 
-def _has_other_readings(closed: Mapping[str, Any]) -> bool:
+def _has_other_readings(excluded: str | None) -> bool:
     """Return True if a session is not used because its readings do not match the present rig."""
-    return (closed["excluded"] or "").startswith((OTHER_RIG_FILE, ZERO_LOST))
+    return (excluded or "").startswith((OTHER_RIG_FILE, ZERO_LOST))

@@ -13,8 +13,10 @@ from calibration.rig.description import Rig
 from daemon.acquisition.joiner import JoinedFix
 from daemon.commands import caller_columns
 from daemon.sessions.open_session import OpenSession
-from daemon.sessions.prisms.evidence import Finding, IdentityLoader, PrismEvidence, Stretch, Verdict, sightings_of
+from daemon.sessions.prisms.evidence import Finding, PrismEvidence, Stretch, Verdict
 from daemon.sessions.prisms.guard import UNTIL, MotionLimit, OperatorConfirmation, PrismGuard, Suspicion, Turn
+from daemon.sessions.prisms.identity_loader import IdentityLoader
+from daemon.sessions.prisms.sightings import sightings_of
 from daemon.sessions.prisms.standstill_places import Exclusions
 from daemon.sessions.station_setups import Place
 from daemon.store.errors import StoreError

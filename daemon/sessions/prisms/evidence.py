@@ -8,11 +8,8 @@ stretch that cannot be compared with anything yet is kept, and judged again when
 
 from __future__ import annotations
 
-import logging
 import math
-import threading
-import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 from typing import TYPE_CHECKING
@@ -23,18 +20,16 @@ import numpy.typing as npt
 from calibration.rig.description import Rig
 from daemon.acquisition.joiner import JoinedFix
 from daemon.sessions.prisms.guard import Turn
+from daemon.sessions.prisms.identity_loader import IdentityLoader
+from daemon.sessions.prisms.sightings import Sighting, targets
 from daemon.sessions.prisms.standstill_places import travel_mm
 from daemon.sessions.station_setups import Place
-from daemon.warm_up import prepare
 from drivers.clock import Stamp
 
 if TYPE_CHECKING:
     from calibration.identification.prism_identity import Misfits, PrismIdentity, Targets
     from daemon.sessions.prisms.motion import TargetMotion
 
-log = logging.getLogger(__name__)
-
-RETRY_S = 30.0  # after the mathematical code could not be loaded
 LATE_S = 0.25  # largest difference between the instants of a fix and of its joints while the boom moves
 MOST_SLACK_MM = 500.0  # a fix whose place is less certain than this, because of the motion, is not used
 MOVED_MM = 100.0  # motion of the boom before another fix of a stretch is used
@@ -51,23 +46,6 @@ class Verdict(Enum):
     OPEN = "undecided"
     NAMED = "the session's prism"
     OTHER = "another target"
-
-
-@dataclass(frozen=True)
-class Sighting:
-    """A target's place with the machine's joints at that instant.
-
-    Attributes:
-        prism: prism that the target is taken for.
-        joints: readings in the rig's order, deg or mm.
-        place_mm: place in the station's frame.
-        slack_mm: largest error of the place that the motion of the boom may cause.
-    """
-
-    prism: str
-    joints: tuple[float, ...]
-    place_mm: Place
-    slack_mm: float = 0.0
 
 
 @dataclass(eq=False)
@@ -108,76 +86,6 @@ class Finding:
     stretch: Stretch
     distance_m: float = 0.0
     is_like: str = ""
-
-
-class IdentityLoader:
-    """Loads the mathematical code in a thread when a session first needs it, and retries on failure.
-
-    Args:
-        rig: the machine.
-
-    Attributes:
-        trouble: why the last attempt to load failed, a clause; None if it did not.
-    """
-
-    def __init__(self, rig: Rig) -> None:
-        self.trouble: str | None = None
-        self._rig = rig
-        self._thread: threading.Thread | None = None
-        self._loaded: PrismIdentity | None = None
-
-    def now(self) -> PrismIdentity | None:
-        """Return the comparison of prisms; None until it is loaded."""
-        return self._loaded
-
-    def motion(self) -> TargetMotion | None:
-        """Return a new comparison of successive fixes; None until the code is loaded."""
-        if self._loaded is None:
-            return None
-        from daemon.sessions.prisms.motion import TargetMotion
-
-        return TargetMotion(self._rig)
-
-    def start(self, wait_s: float = 0.0) -> None:
-        """Start loading, and wait for its end for at most `wait_s` seconds."""
-        if self._thread is None:
-            thread = threading.Thread(target=self._run, name="prism-identity", daemon=True)
-            try:
-                thread.start()
-            except RuntimeError as error:  # the system cannot start a thread; the next session tries again
-                self._fail(error)
-                return
-            self._thread = thread
-        if wait_s:
-            self._thread.join(wait_s)
-
-    def _run(self) -> None:
-        while self._loaded is None:
-            try:
-                self._loaded = self._load()
-                self.trouble = None
-            except Exception as error:  # noqa: BLE001 - what the computer lacks may be available the next time
-                self._fail(error)
-                time.sleep(RETRY_S)
-
-    def _load(self) -> PrismIdentity:
-        prepare()
-        import daemon.sessions.prisms.motion  # noqa: F401  # so that no later call waits for it
-        from calibration.identification.prism_identity import PrismIdentity
-
-        made = PrismIdentity(self._rig)
-        middle = tuple(sum(joint.limits) / 2 for joint in self._rig.joints)
-        made.own_misfits(targets(self._rig, [Sighting(self._rig.prism_names[0], middle, (0.0, 0.0, 0.0))]))
-        return made
-
-    def _fail(self, error: Exception) -> None:
-        trouble = f"{type(error).__name__}: {error}"
-        if trouble != self.trouble:
-            log.error(
-                "prisms cannot be checked against the joints at present; new locks are judged by distance alone",
-                exc_info=error,
-            )
-        self.trouble = trouble
 
 
 class PrismEvidence:
@@ -424,31 +332,3 @@ class PrismEvidence:
 def _some(sightings: Sequence[Sighting]) -> Sequence[Sighting]:
     """Return a few of a stretch's sightings, spread over its whole length."""
     return sightings[:: math.ceil(len(sightings) / MOST_OF_GROUP) or 1]
-
-
-def sightings_of(rig: Rig, rows: Sequence[tuple[str, Mapping[str, float], Place]]) -> list[Sighting]:
-    """Return sightings from stored observations; rows with an unknown prism or a missing joint are skipped.
-
-    Args:
-        rig: the machine.
-        rows: prism, value by column, and place in mm of each observation.
-    """
-    columns = [joint.column for joint in rig.joints]
-    return [
-        Sighting(prism, tuple(values[column] for column in columns), place_mm)
-        for prism, values, place_mm in rows
-        if prism in rig.prism_names and all(column in values for column in columns)
-    ]
-
-
-def targets(rig: Rig, sightings: Sequence[Sighting]) -> Targets:
-    """Return sightings as arrays."""
-    from calibration.identification.prism_identity import Targets
-
-    names = rig.prism_names
-    return Targets(
-        np.array([one.joints for one in sightings], dtype=np.float64).reshape(-1, len(rig.joints)),
-        np.array([names.index(one.prism) for one in sightings], dtype=np.intp),
-        np.array([one.place_mm for one in sightings], dtype=np.float64).reshape(-1, 3),
-        np.array([one.slack_mm for one in sightings], dtype=np.float64),
-    )

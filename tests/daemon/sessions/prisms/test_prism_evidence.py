@@ -12,7 +12,9 @@ import pytest
 
 from calibration.identification.prism_identity import PrismIdentity
 from calibration.rig.description import parse_rig
-from daemon.sessions.prisms.evidence import IdentityLoader, PrismEvidence, Sighting, Verdict, targets
+from daemon.sessions.prisms.evidence import PrismEvidence, Verdict
+from daemon.sessions.prisms.identity_loader import IdentityLoader
+from daemon.sessions.prisms.sightings import Sighting, targets
 from daemon.sessions.station_setups import Place
 from drivers.readings import EventKind
 from simulators.rig.truth import RigTruth
@@ -198,7 +200,7 @@ def loaded() -> tuple[IdentityLoader, PrismIdentity]:
 
 
 def test_what_cannot_be_loaded_is_told_and_loaded_once_it_can_be(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("daemon.sessions.prisms.evidence.RETRY_S", 0.05)
+    monkeypatch.setattr("daemon.sessions.prisms.identity_loader.RETRY_S", 0.05)
     loader = IdentityLoader(RIG)
     with monkeypatch.context() as without:
         for variable in ("NUMBA_CACHE_DIR", "CACHE_DIRECTORY", "XDG_CACHE_HOME", "HOME"):
