@@ -114,6 +114,7 @@ def test_pages_follow_a_dark_screen_and_stay_light_on_paper(pages: dict[str, str
 
 
 @pytest.mark.long
+@pytest.mark.filterwarnings("ignore:HarfBuzz-Subset:DeprecationWarning")  # what the computer has not yet
 def test_a_report_is_printed_on_numbered_pages(pages: dict[str, str], tmp_path: Path) -> None:
     try:
         import weasyprint
