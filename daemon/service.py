@@ -341,8 +341,7 @@ class Daemon:
         try:
             self._sessions.on_records(records)  # feeds the joiner, which the tip reads
         finally:
-            self._tip.on_records(records)  # even if an observation cannot be made: an encoder may have jumped
-            if self._tip.has_jumped(records):
+            if self._tip.on_records(records):  # also where no observation can be made: an encoder may have jumped
                 self._sessions.pending.once_stored(self._live_model.changed)
             self._guide.on_records(records)
 

@@ -110,24 +110,23 @@ class LiveTip:
         self._state: MachineState | str = "no joint was read yet"
         self._is_failing = False
 
-    def on_records(self, records: Sequence[Record]) -> None:
+    def on_records(self, records: Sequence[Record]) -> bool:
         """Note the joiner's state, which includes these records already; cheap while no model is live.
 
-        Where a joint has jumped there is no tip until the model is loaded again (`LiveModel.changed`), which must wait
-        until the jump is stored.
+        Returns:
+            True if a joint's encoder has jumped. Then there is no tip until the model is loaded again
+            (`LiveModel.changed`), which must wait until the jump is stored.
         """
-        if self.has_jumped(records):
-            self._model.void()
-        if isinstance(self._model.now(), Loaded):
-            self._state = self._joiner.latest()
-
-    def has_jumped(self, records: Sequence[Record]) -> bool:
-        """Return True if a joint's encoder has jumped."""
         joints = self._rig.joint_names
-        return any(
+        has_jumped = any(
             isinstance(one, DeviceEvent) and one.kind is EventKind.PRESET_JUMP and one.device in joints
             for one in records
         )
+        if has_jumped:
+            self._model.void()
+        if isinstance(self._model.now(), Loaded):
+            self._state = self._joiner.latest()
+        return has_jumped
 
     def tip_command(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
         """Return the present position of a prism, by default the configured one."""

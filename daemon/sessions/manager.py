@@ -143,6 +143,8 @@ class SessionManager:
     def _judge_again(self, records: Sequence[Record]) -> None:
         """Judge sessions again of which more has become known, while all fixes before these records are stored."""
         for session in self._taking():
+            if not session.is_outdated:
+                continue
             first = next((r.stamp for r in records if isinstance(r, Fix) and session.lasted(r.stamp)), None)
             if first is not None and self._prisms.is_judged_again(session, first):
                 self._observing.restore(session)

@@ -239,12 +239,10 @@ class PrismWatch:
         self.judge_again(session)
 
     def is_judged_again(self, session: OpenSession, until: Stamp) -> bool:
-        """Do as `judge_again` if a control point was located since; return False if not, or if that must wait.
+        """Do as `judge_again`; return False if that must wait.
 
         A computer that lacks a descriptor or memory keeps the judgement so far; it is tried again at the next fix.
         """
-        if not session.is_outdated:
-            return False
         try:
             self.judge_again(session, until)
         except (OSError, sqlite3.Error, StoreError, MemoryError) as error:

@@ -20,11 +20,11 @@ from daemon.store.rows import RowSource, marks
 from daemon.store.views import in_session
 from drivers.clock import NS_PER_S, Stamp
 
-# Why calibration does not use a session, a clause; NULL if it does. All queries of used sessions are made from this.
 SESSION_COLUMNS = (
     *("id", "rig", "setup_id", "prism", "kind", "state", "operator", "note", "started_utc_ns", "ended_utc_ns"),
     "not_used",
 )
+# Why calibration does not use a session, a clause; NULL if it does. All queries of used sessions are made from this.
 _NOT_USED = """CASE state WHEN 'open' THEN 'it is still open' WHEN 'aborted' THEN 'it was aborted' ELSE excluded END"""
 _USED = f"SELECT rowid AS number, * FROM calibration_sessions WHERE ({_NOT_USED}) IS NULL"
 BEFORE_NS = 60 * NS_PER_S  # dwell and direction of a session's first fixes depend on motion before it

@@ -25,18 +25,9 @@ WAITED = range(10, 20)  # the last half second of the first batch: its fixes wai
 def test_a_session_whose_end_is_decoded_with_what_came_a_minute_later_keeps_its_fixes(session_rig: Rig) -> None:
     session_rig.say("start", prism="r")
     measured: list[list[Record]] = []
-
-    def measure(instants: int) -> None:
-        for _ in range(instants):
-            session_rig.clock.advance(STEP_S)
-            now = session_rig.clock.now()
-            session_rig.store.append_captures([CanCapture("boom", now, 0x181, len(measured).to_bytes(2, "little"))])
-            joints = [Reading(j.name, now, session_rig.values[j.name], j.unit) for j in SOURCE.rig.joints]
-            measured.append([*joints, session_rig.fix()])
-
-    measure(100)
+    capture(session_rig, measured, 100)
     session_rig.say("stop")
-    measure(1400)
+    capture(session_rig, measured, 1400)
     session_rig.keeper = session_rig.new_keeper()
     acquisition = Acquisition(
         [],
@@ -69,16 +60,21 @@ class Measured:
         return []
 
 
+def capture(rig: Rig, measured: list[list[Record]], instants: int) -> None:
+    """Capture what is measured at so many instants, and add the records that it stands for."""
+    for _ in range(instants):
+        rig.clock.advance(STEP_S)
+        now = rig.clock.now()
+        rig.store.append_captures([CanCapture("boom", now, 0x181, len(measured).to_bytes(2, "little"))])
+        measured.append([*(Reading(j.name, now, rig.values[j.name], j.unit) for j in SOURCE.rig.joints), rig.fix()])
+
+
 def left_by_a_killed_run(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> list[list[Record]]:
     """Four seconds of a session that were captured, and are to be decoded one second at a time."""
     monkeypatch.setattr("daemon.acquisition.backlog.BATCH_CAPTURES", 20)
     rig.say("start", prism="r")
     measured: list[list[Record]] = []
-    for _ in range(80):
-        rig.clock.advance(STEP_S)
-        now = rig.clock.now()
-        rig.store.append_captures([CanCapture("boom", now, 0x181, len(measured).to_bytes(2, "little"))])
-        measured.append([*(Reading(j.name, now, rig.values[j.name], j.unit) for j in SOURCE.rig.joints), rig.fix()])
+    capture(rig, measured, 80)
     rig.clock.advance(STEP_S)
     return measured
 

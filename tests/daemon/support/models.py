@@ -142,9 +142,9 @@ class ModelRig:
     def take(self, records: Sequence[Record]) -> None:
         """Hand records on and store them, as the writer does."""
         self.joiner.feed(records)
-        self.tip.on_records(records)
+        has_jumped = self.tip.on_records(records)
         self.store.insert_records(records)
-        if self.tip.has_jumped(records):
+        if has_jumped:
             self.live.changed()
 
 
