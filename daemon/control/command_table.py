@@ -99,7 +99,9 @@ COMMANDS: Mapping[str, Command] = MappingProxyType(
             "returns one model with its comparison and history", id="number of the model; the live one by default"
         ),
         "model.accept": _changes("makes a candidate the live model", _MODEL),
-        "model.reject": _changes("retires a candidate", {**_MODEL, "reason": "text: why; kept with the model"}),
+        "model.reject": _changes(
+            "retires a candidate or the live model", {**_MODEL, "reason": "text: why; kept with the model"}
+        ),
         "model.rollback": _changes(
             "makes a formerly live model live again",
             id="number of the model; the one that the live model replaced by default",

@@ -58,16 +58,24 @@ class JobQueue:
             has_model=self.table.has_done(JobKind.GAP),
             live_from=run.after_session if run else None,
             drifted=self._models.drifted(run) if run else None,
-            stale_candidate=self._stale_candidate(run) if run else None,
+            stale_candidate=self._stale_candidate(run),
             has_guide=self._guides.is_open(),
         )
 
-    def _stale_candidate(self, run: LiveRun) -> int | None:
-        """See `State.stale_candidate`; one comparison per model that goes live, so that a failing one does not loop."""
+    def _stale_candidate(self, run: LiveRun | None) -> int | None:
+        """See `State.stale_candidate`; one comparison per change of live model, so that a failing one does not loop."""
         candidate = self._models.waiting()
-        if candidate is None or candidate.comparison is None or candidate.comparison["live"] == run.model_id:
+        if candidate is None or candidate.comparison is None:
             return None
-        return None if self.table.is_comparison_queued(candidate.id, run.since) else candidate.id
+        if candidate.comparison["live"] == (run.model_id if run else None):
+            return None
+        since = self._live_since(run)
+        is_queued = since is None or self.table.is_comparison_queued(candidate.id, since)
+        return None if is_queued else candidate.id
+
+    def _live_since(self, run: LiveRun | None) -> int | None:
+        """Return the number of the change by which the live model went live, or else since which none is live."""
+        return run.since if run else self._models.newest_retirement()
 
     # ---- orders ------------------------------------------------------------------------------------------------------
 
@@ -381,7 +389,7 @@ class JobQueue:
         run = self._models.live_run()
         through = closed[-1]["id"]
         job_id = self._add(
-            JobKind.COMPARISON, checks[-1], through, model_id=model.id, live_since=run.since if run else None
+            JobKind.COMPARISON, checks[-1], through, model_id=model.id, live_since=self._live_since(run)
         )
         return f"job {job_id} will compare model {model.id} with the live one"
 

@@ -5,8 +5,8 @@ lacks, then residual training. The report and the comparison with the live model
 A closed check session triggers only report and comparison. Its poses are not trained on, and the live model is checked
 for drift on it. Once the checks show drift of the live model, the whole chain runs on all sessions, checks included.
 A session that no control points confirm triggers nothing until an operator accepts it. A candidate that was compared
-with a model that is no longer live is compared again, once for each model that goes live. Jobs wait while a session is
-open: acquisition comes first.
+with a model that is no longer live is compared again, once for each change of the live model. Jobs wait while a session
+is open: acquisition comes first.
 
 The order of sessions decides which sessions a job covers, never time: a wall clock may be wrong for a whole boot.
 """

@@ -85,32 +85,35 @@ class ModelRegistry:
         return self._changed(model, live) | {"reason": reason}
 
     def reject_command(self, arguments: Mapping[str, Any]) -> str:
-        """Retire a candidate, so that nobody accepts it by mistake; the reason is stored."""
+        """Retire a candidate, so that nobody accepts it by mistake, or the live model, so that there is no tip from it.
+
+        The reason is stored. No other model takes the place of a live one by itself.
+        """
         model = self._own(self._table.get(arguments.get("id")))
         reason = text_argument(arguments, "reason").strip()
         if not reason:
             raise CommandError(f"give a reason for rejecting model {model.id}; it is stored with the model")
         operator = text_argument(arguments, "operator")
-        if model.state != "candidate" or not self._table.reject(
-            model, f"rejected: {reason}", operator=operator, **caller_columns()
-        ):
+        if not self._table.reject(model, f"rejected: {reason}", operator=operator, **caller_columns()):
             state = self._table.get(model.id).state
-            raise CommandError(f"model {model.id} is {state}; only a candidate can be rejected")
+            raise CommandError(f"model {model.id} is {state}; only a candidate or the live model can be rejected")
         log.warning("model %d was rejected by %s: %s", model.id, operator or "an unnamed operator", reason)
-        return f"model {model.id} is rejected"
+        if model.state == "candidate":
+            return f"model {model.id} is rejected"
+        self._live.changed()
+        return f"model {model.id} is rejected; no model is live now, and there is no corrected position"
 
     def rollback_command(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
         """Make the predecessor of the live model live again, or any other model that was live before."""
         live = self._table.live()
         wanted = arguments.get("id")
         if wanted is None:
-            if live is None:
-                raise CommandError("no model is live, so there is nothing to roll back; see `rigcal model list`")
-            wanted = self._table.predecessor(live)
+            wanted = None if live is None else self._table.predecessor(live)
             if wanted is None:
                 others = [m.id for m in self._table.all() if m.state == "retired" and self._table.was_live(m)]
                 instead = f"name one, as `rigcal model rollback {others[-1]}`" if others else "accept a better model"
-                raise CommandError(f"model {live.id} was the first to go live and has no predecessor; {instead}")
+                why = f"model {live.id} was the first to go live and has no predecessor" if live else "no model is live"
+                raise CommandError(f"{why}; {instead}")
         model = self._own(self._table.get(wanted))
         if model.state != "retired" or not self._table.was_live(model):
             why = {

@@ -252,6 +252,12 @@ def test_a_model_is_accepted_rejected_and_rolled_back_behind_a_confirmation(new_
             assert live(config) == 2
             history = request(config.socket_path, "model.show", {"id": 2})["history"]
             assert history[-1]["operator"].endswith("(page, approve)")
+            page.locator("[data-model='2']").get_by_role("button", name="Reject").click()
+            expect(dialog).to_contain_text("there is no corrected position from then on")
+            dialog.get_by_text("Measured wrongly").click()
+            dialog.get_by_role("button", name="Reject").click()
+            expect(page.locator("[data-model='2'] .tag")).to_have_text("retired", timeout=DEADLINE_MS)
+            assert request(config.socket_path, "status")["models"]["live"] is None
         finally:
             assert web.stop() == 0
 

@@ -103,7 +103,8 @@ def model_drifted(evidence: Evidence) -> Iterator[Finding]:
 @rule(
     "warning",
     "Accept a model that was trained without the session, once there is one, or return to an earlier model with "
-    "`rigcal model rollback NUMBER`; `rigcal model list` shows all.",
+    "`rigcal model rollback NUMBER`; `rigcal model list` shows all. `rigcal model reject NUMBER` takes this one out of "
+    "use at once.",
 )
 def model_of_rejected_session(evidence: Evidence) -> Iterator[Finding]:
     """The live model was trained on a session that an operator has rejected since.

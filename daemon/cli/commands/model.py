@@ -78,9 +78,10 @@ def model_accept(number: int, operator: str, **where: Any) -> Any:
 @operator_option
 @client_options
 def model_reject(number: int, reason: str, operator: str, **where: Any) -> Any:
-    """Retire candidate NUMBER permanently.
+    """Retire model NUMBER: a candidate, or the live model.
 
-    Then nobody can accept it by mistake.
+    Nobody can then accept the candidate by mistake. If the model was live, there is no corrected position from then on,
+    until a candidate is accepted or a model that was live before is put back.
     """
     return ask(where, "model.reject", echo, id=number, reason=reason, operator=operator)
 

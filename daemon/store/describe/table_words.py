@@ -300,7 +300,7 @@ TABLES: dict[str, Words] = {
             "model_id": "model of a comparison requested by an operator",
             "host_boot": "the kernel's boot in which it was started",
             "interruptions": "how often a shutdown of the computer or the daemon interrupted it",
-            "live_since": "change by which the model with which it compares had gone live",
+            "live_since": "change by which the model with which it compares had gone live, or none was live any more",
         },
         {"created_": "creation", "started_": "start of the last attempt", "ended_": "end"},
     ),

@@ -180,7 +180,7 @@ class JobTable:
         return self._store.number(_COVERED, (self._rig, after_session, kind.value, kind is not JobKind.GAP))
 
     def is_comparison_queued(self, model_id: int, live_since: int) -> bool:
-        """Return True if a comparison of a model with the one that went live by change `live_since` was ever queued."""
+        """Return True if a model's comparison was ever queued while the live model was that of change `live_since`."""
         sql = "SELECT 1 FROM jobs WHERE kind = 'comparison' AND model_id = ? AND live_since = ? LIMIT 1"
         return bool(self._store.rows(sql, (model_id, live_since)))
 

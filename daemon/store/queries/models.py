@@ -1,8 +1,9 @@
 """The tables of models: every model and its state, all changes of states, and results of live models on check sessions.
 
-A model is created as a candidate, goes live when an operator accepts it, and is retired when another model replaces it;
-it can be made live again. Each rig has one live model. Each change adds a row to `model_states`. No model and no change
-is ever deleted, and neither are the models' directories. Results on check sessions are deleted to be made anew.
+A model is created as a candidate, goes live when an operator accepts it, and is retired when another model replaces it
+or an operator rejects it; it can be made live again. Each rig has at most one live model. Each change adds a row to
+`model_states`. No model and no change is ever deleted, and neither are the models' directories. Results on check
+sessions are deleted to be made anew.
 """
 
 from __future__ import annotations
@@ -30,6 +31,8 @@ _LIVE_RUN = """SELECT state.id AS since, model.id AS model_id, coalesce(state.af
     FROM models AS model CROSS JOIN model_states AS state ON state.model_id = model.id
     WHERE model.rig = ? AND model.state = 'live' AND state.state = 'live' AND state.zeros_checked_through IS NULL
     ORDER BY state.id DESC LIMIT 1"""
+_NEWEST_RETIREMENT = """SELECT max(state.id) AS number FROM models AS model
+    CROSS JOIN model_states AS state ON state.model_id = model.id WHERE model.rig = ? AND state.state = 'retired'"""
 _DRIFTED = """SELECT session.rowid AS number, session.id FROM drift_checks AS drift
     CROSS JOIN calibration_sessions AS session ON session.id = drift.session_id
     WHERE drift.live_since = ? AND drift.alarm = 'worse' ORDER BY drift.id LIMIT 1"""
@@ -198,6 +201,11 @@ class ModelTable:
         found = self._store.rows(_LIVE_RUN, (self._rig,))
         return LiveRun(**found[0]) if found else None
 
+    def newest_retirement(self) -> int | None:
+        """Return the number of the newest change by which a model of the rig was retired; None before the first."""
+        (found,) = self._store.rows(_NEWEST_RETIREMENT, (self._rig,))
+        return None if found["number"] is None else int(found["number"])
+
     def drifted(self, run: LiveRun) -> tuple[int, str] | None:
         """Return number and id of the check session that showed drift of a live model; None if none did."""
         found = self._store.rows(_DRIFTED, (run.since,))
@@ -267,18 +275,18 @@ class ModelTable:
         return True
 
     def reject(self, model: ModelRow, reason: str, **by: object) -> bool:
-        """Retire a candidate that an operator does not want; it never goes live.
+        """Retire a candidate or the live model, which an operator does not want.
 
         Args:
-            model: the model.
+            model: the model, as it was when the decision was made.
             reason: why, a clause.
             by: as for `go_live`.
 
         Returns:
-            False, with nothing changed, if the model is no longer a candidate.
+            False, with nothing changed, if the model is retired already or has changed its state since.
         """
         with self._store.transaction():
-            if self.get(model.id).state != "candidate":
+            if model.state == "retired" or self.get(model.id).state != model.state:
                 return False
             self._store.update("models", {"id": model.id}, {"state": "retired"})
             self._note_state(model.id, "retired", reason, **by)

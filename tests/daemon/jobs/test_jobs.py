@@ -385,6 +385,6 @@ def test_looking_for_work_stays_cheap_after_years(rig: JobRig) -> None:
         jobs.table.unfinished()
         db.conn.set_progress_handler(None, 0)
         db.conn.set_trace_callback(None)
-    assert len(statements) <= 8
+    assert len(statements) <= 9
     assert not any("FROM boots" in statement for statement in statements)
     assert steps < 15_000

@@ -148,6 +148,20 @@ def test_a_comparison_with_another_live_model_is_made_again_by_itself_and_once(r
     assert f"`rigcal model accept {waiting}`" in advice(rig)
 
 
+@pytest.mark.long
+def test_a_comparison_with_a_live_model_that_was_rejected_is_made_again_by_itself_and_once(rig: ModelRig) -> None:
+    live, waiting = checked(rig)
+    rig.compared(waiting, live=live)
+    rig.registry.reject_command({"id": live, "reason": "trained on another prism"})
+    rig.jobs.start()
+    rig.jobs.wait(lambda: comparisons(rig, waiting) == ["done"], "the comparison")
+    rig.jobs.look_on()
+    assert comparisons(rig, waiting) == ["done"]
+    compared = rig.models.get(waiting).comparison
+    assert compared is not None
+    assert compared["live"] is None
+
+
 def test_a_comparison_that_fails_is_not_made_again_for_ever(rig: ModelRig) -> None:
     _, waiting = checked(rig)
     rig.jobs.plan(comparison="fail")

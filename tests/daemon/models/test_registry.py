@@ -22,7 +22,7 @@ from daemon.jobs.order import Outcome
 from daemon.jobs.process import perform
 from daemon.jobs.runner import JobRunner
 from daemon.jobs.scheduler import CHAIN, DueChain
-from daemon.models.live_model import LiveModel, Loaded, Missing
+from daemon.models.live_model import NO_MODEL, LiveModel, Loaded, Missing
 from daemon.models.model_files import model_sha256, write_model
 from daemon.sessions.lifecycle import SessionLifecycle
 from daemon.store.errors import NotInStoreError
@@ -557,4 +557,15 @@ def test_a_rejected_candidate_never_goes_live(rig: ModelRig) -> None:
     assert "only a candidate" in refusal(rig.registry.accept_command, WRONG_USE, id=model)
     assert "was rejected" in refusal(rig.registry.rollback_command, WRONG_USE, id=model)
     assert "only a candidate" in refusal(rig.registry.reject_command, WRONG_USE, id=model, reason="again")
-    assert "only a candidate" in refusal(rig.registry.reject_command, WRONG_USE, id=live, reason="no")
+
+
+def test_a_live_model_that_is_rejected_is_out_of_use_at_once_and_can_be_put_back(rig: ModelRig) -> None:
+    live = rig.accepted()
+    assert isinstance(rig.settled(), Loaded)
+    told = rig.registry.reject_command({"id": live, "reason": "trained on w", "operator": "Ada"})
+    assert "no model is live now" in told
+    assert isinstance(rig.live.now(), Missing)
+    assert rig.settled() == Missing(NO_MODEL)
+    assert rig.registry.status()["live"] is None
+    assert f"`rigcal model rollback {live}`" in refusal(rig.registry.rollback_command, WRONG_USE)
+    assert rig.registry.rollback_command({"id": live, "operator": "Ada"})["live"] == live

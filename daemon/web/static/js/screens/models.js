@@ -71,7 +71,7 @@ function card(model, jobs, now, app) {
     errors(model),
     h("div", { class: "row" },
       candidate?.is_acceptable ? app.button(`Accept model ${model.id}`, "approve", () => accept(model, compared, now, app), "main") : null,
-      model.state === "candidate" ? app.button("Reject", "approve", () => reject(model, app), "danger") : null,
+      model.state !== "retired" ? app.button("Reject", "approve", () => reject(model, app), "danger") : null,
       model.state === "retired" && model.history.some((change) => change.state === "live") ? app.button(`Put model ${model.id} back`, "approve", () => putBack(model, now, app)) : null,
       model.state === "live" ? app.button("Roll back", "approve", () => rollBack(model, now, app), "danger") : null,
       model.state === "candidate" ? app.button("Compare again", "operate", () => app.run("model.compare", { id: model.id })) : null,
@@ -95,7 +95,10 @@ async function accept(model, compared, now, app) {
 }
 
 async function reject(model, app) {
-  const reason = await app.confirm(`Reject model ${model.id}?`, ["It stays in the store and never goes live.", "The live model stays as it is."], "Reject", { kind: "danger", reason: ["Measured wrongly", "Not plausible", "A new model follows"] });
+  const effects = model.state === "live"
+    ? ["No other model takes its place: there is no corrected position from then on.", "It stays in the store and can be put back."]
+    : ["It stays in the store and never goes live.", "The live model stays as it is."];
+  const reason = await app.confirm(`Reject model ${model.id}?`, effects, "Reject", { kind: "danger", reason: ["Measured wrongly", "Not plausible", "A new model follows"] });
   if (reason) await app.run("model.reject", { id: model.id, reason }, `Model ${model.id} is rejected`);
 }
 
