@@ -388,9 +388,7 @@ class JobQueue:
             )
         run = self._models.live_run()
         through = closed[-1]["id"]
-        job_id = self._add(
-            JobKind.COMPARISON, checks[-1], through, model_id=model.id, live_since=self._live_since(run)
-        )
+        job_id = self._add(JobKind.COMPARISON, checks[-1], through, model_id=model.id, live_since=self._live_since(run))
         return f"job {job_id} will compare model {model.id} with the live one"
 
     def compare_again(self, model_id: int) -> str:
