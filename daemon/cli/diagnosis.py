@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from daemon.cli.lines.state import LATE, channel_status
 from drivers.can.bus_options import slcan_port
-from drivers.readings import GapReason
+from drivers.readings import GapReason, Status
 
 if TYPE_CHECKING:
     from daemon.config.config import Config
@@ -385,8 +385,14 @@ def _station(station: Mapping[str, Any], late: str) -> Finding:
         LINK_DOWN: "check the plug, the cable, and the power of adapter and station",
         SILENT: "check its power and cable, and that it still measures",
         STARTING: "wait some seconds; if nothing arrives, check its power and cable",
+        Status.TIME_DOUBTFUL: "its records are read too late: check what keeps the computer busy",
     }
-    remedy = remedies.get(station["status"], "aim it at the prism and lock it")
+    aim = (
+        "level it and switch its compensator on"
+        if station.get("tilt_ok") is False
+        else "aim it at the prism and lock it"
+    )
+    remedy = remedies.get(station["status"], aim)
     return Finding(name, "warning", station["sentence"], remedy)
 
 

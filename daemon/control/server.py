@@ -49,7 +49,8 @@ class Limits:
         line_s: wait for the end of a request that has begun.
         idle_s: wait for the start of the next request.
         send_s: wait for an answer to be read.
-        give_way_s: when all places are taken, a client that has sent no complete request for this long is disconnected.
+        give_way_s: when all places are taken, a client that for this long has sent no complete request, or has not read
+            an answer, is disconnected.
     """
 
     clients: int = 32
@@ -64,7 +65,8 @@ class _Client:
     """A connection.
 
     Attributes:
-        waiting_ns: when the wait for its next request began; None while a command is carried out.
+        waiting_ns: when the wait for its next request, or for it to read an answer, began; None while a command is
+            carried out.
         received: bytes of requests that are not yet parsed.
     """
 
@@ -252,6 +254,8 @@ class ControlServer:
                 caller = _peer_of(client.connection)
                 while (line := self._next_line(client)) is not None:
                     answer = self._answer(line, caller, lambda: _is_closed_by_peer(client.connection))
+                    with self._lock:
+                        client.waiting_ns = self._clock.monotonic_ns()
                     client.connection.settimeout(self._limits.send_s)
                     client.connection.sendall(answer)
                     if len(line) > MAX_LINE_BYTES:

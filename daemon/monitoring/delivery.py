@@ -27,6 +27,7 @@ from drivers.clock import NS_PER_S, SystemClock
 WEBHOOK_TIMEOUT_S = 10.0  # for a whole delivery, as COMMAND_TIMEOUT_S
 COMMAND_TIMEOUT_S = 30.0
 _QUOTED = 200  # characters of a server's or a command's output in an error message
+_LONGEST_LINE_BYTES = 998  # of an e-mail, RFC 5322
 _KEPT_BYTES = 4096  # of the end of a command's output
 _PIPE_BYTES = 65536  # capacity of a pipe
 
@@ -267,7 +268,8 @@ def _email(message: Message) -> bytes:
     email = EmailMessage()
     email["Subject"] = message.subject
     email["Auto-Submitted"] = "auto-generated"  # RFC 3834: suppresses automatic replies
-    email.set_content(message.text, cte="8bit")
+    is_long = any(len(line) > _LONGEST_LINE_BYTES for line in message.text.encode().splitlines())
+    email.set_content(message.text, cte="quoted-printable" if is_long else "8bit")
     return bytes(email)
 
 

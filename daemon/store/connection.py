@@ -24,6 +24,7 @@ from daemon.store.migrations import MIGRATIONS, pending_migrations, unknown_migr
 from daemon.store.reader import Reader
 from daemon.store.rows import SqlValue, marks, sql_value, stamp_of, stored_text
 from daemon.store.views import drop_views, make_views
+from daemon.store.write_ahead_log import KEPT_BYTES
 from drivers.clock import Stamp
 
 log = logging.getLogger(__name__)
@@ -93,7 +94,9 @@ class Connection:
         connection.execute("PRAGMA synchronous = FULL")
         connection.execute("PRAGMA foreign_keys = ON")
         connection.execute("PRAGMA secure_delete = OFF")  # Debian's default: pages that are freed are written once more
-        connection.execute("PRAGMA journal_size_limit = 67108864")  # a WAL grown behind a slow reader shrinks again
+        connection.execute(
+            f"PRAGMA journal_size_limit = {KEPT_BYTES}"
+        )  # a log grown behind a slow reader shrinks again
         if later := unknown_migrations(self._db):
             raise StoreError(f"{self.path}: made by a newer rigcal (it has {later[0]}); install that version")
         if pending_migrations(self._db):

@@ -20,6 +20,7 @@ from daemon.host.priority import UPKEEP_NICE, lower_priority
 from daemon.store.errors import storage_sentence
 from daemon.store.files import FileIdentity
 from daemon.store.store import Store
+from daemon.store.write_ahead_log import log_bytes, reader_of
 from drivers.clock import Clock, Stamp, TimeBudget
 
 log = logging.getLogger(__name__)
@@ -31,6 +32,7 @@ STOP_S = 5.0
 LOW_BYTES = 2**30
 LOW_SHARE = 0.05
 LOW_SHARE_MOST_BYTES = 10 * 2**30
+LONG_LOG_BYTES = 256 * 2**20  # several minutes in which the log could not be emptied
 FINDINGS = 5
 RETRY_S = 5.0
 # Errors that prevent a check but do not concern the store: no descriptors, no memory, a lock, a full disk.
@@ -55,6 +57,8 @@ class StoreHealth:
         since: when it entered this state.
         free_bytes: free space on the store's disk; None if the file system cannot be read.
         is_low: less than 1 GiB is free, or less than both 5 % of the disk and 10 GiB.
+        log_reader: another process that keeps the store's log from being emptied, which has grown for that reason; None
+            if there is none.
     """
 
     state: HealthState
@@ -62,6 +66,7 @@ class StoreHealth:
     since: Stamp
     free_bytes: int | None
     is_low: bool
+    log_reader: str | None = None
 
     @property
     def is_unsound(self) -> bool:
@@ -76,6 +81,7 @@ class StoreHealth:
             "since_utc_ns": self.since.utc_ns,
             "free_bytes": self.free_bytes,
             "is_low": self.is_low,
+            "log_reader": self.log_reader,
         }
 
 
@@ -122,11 +128,11 @@ class StoreWatch:
         """Check files and free space; takes microseconds, unless the file system hangs."""
         state, text = self._state()
         free_bytes, is_low = _space(self._store.path.parent)
-        before = self.health
+        before, reader = self.health, self._log_reader()
         if state == before.state:
-            self.health = replace(before, text=text, free_bytes=free_bytes, is_low=is_low)
+            self.health = replace(before, text=text, free_bytes=free_bytes, is_low=is_low, log_reader=reader)
             return
-        self.health = StoreHealth(state, text, self._clock.now(), free_bytes, is_low)
+        self.health = StoreHealth(state, text, self._clock.now(), free_bytes, is_low, reader)
         if text:
             log.log(logging.INFO if state == "checking" else logging.CRITICAL, "%s", text)
         else:
@@ -160,6 +166,12 @@ class StoreWatch:
                 "continues, and jobs wait"
             )
         return "ok", ""
+
+    def _log_reader(self) -> str | None:
+        with contextlib.suppress(OSError):
+            if log_bytes(self._store.path) > LONG_LOG_BYTES:
+                return reader_of(self._store.path)
+        return None
 
     def _copies(self) -> str:
         """Return shell commands that copy the open files, which have lost their names; "" if they are not found."""

@@ -71,7 +71,11 @@ def decoding_behind(evidence: Evidence) -> Iterator[Finding]:
         yield "decoding", "captures are waiting to be decoded: readings and fixes are late, and jobs wait"
 
 
-@rule("critical", "Correct what the alarm names. If the alarm stays, restart rigcal: `systemctl restart rigcal`.")
+@rule(
+    "critical",
+    "Correct what the alarm names. If the alarm stays, restart rigcal: `systemctl restart rigcal`.",
+    hold_s=5.0,
+)
 def control_dead(evidence: Evidence) -> Iterator[Finding]:
     """No one can connect to a control socket of the daemon.
 

@@ -106,6 +106,24 @@ def backup_overdue(evidence: Evidence) -> Iterator[Finding]:
         yield "backup", "the newest backup is older than 3 days"
 
 
+@rule(
+    "warning",
+    "End the process, or close the query that it has left open. A program that watches the store for long should open "
+    "it anew for each query.",
+    after_s=30.0,
+    hold_s=60.0,
+)
+def store_log_grows(evidence: Evidence) -> Iterator[Finding]:
+    """Another program has been reading the store for so long that its log (`-wal`) is larger than 256 MiB.
+
+    SQLite cannot empty the log while a transaction or a cursor is left open, so it takes up all the disk in time.
+    Deletion of old captures would give no space back, and does not begin. Cleared a minute after the log can be
+    emptied, or when no other process reads the store.
+    """
+    if evidence.store is not None and evidence.store.log_reader is not None:
+        yield "store", f"the store's log grows because {evidence.store.log_reader} does not finish reading the store"
+
+
 @rule("warning", "Free space on the disk of the store.", hold_s=60.0)
 def disk_nearly_full(evidence: Evidence) -> Iterator[Finding]:
     """Little of the store's disk is free: less than 1 GiB, or less than both 5 % and 10 GiB.

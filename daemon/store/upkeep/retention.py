@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from daemon.store.queries.sessions import AFTER_NS, BEFORE_NS
 from daemon.store.rows import RowSource
 from daemon.store.store import Store
+from daemon.store.write_ahead_log import KEPT_BYTES, log_bytes
 from drivers.clock import NS_PER_S, Clock
 
 Place = tuple[int, int]  # row of a boot, and ns of its monotonic clock; places sort in order of time
@@ -63,17 +64,20 @@ class Room:
     Attributes:
         disk_bytes: free space on its disk.
         inside_bytes: free pages in the store's file.
-        least_bytes: smallest sum of both; below it the oldest data are deleted.
+        log_bytes: space that the store's log takes while a reader keeps it from being emptied. It becomes free when the
+            reader ends, and not by any deletion.
+        least_bytes: smallest sum of these; below it the oldest data are deleted.
     """
 
     disk_bytes: int
     inside_bytes: int
+    log_bytes: int
     least_bytes: int
 
     @property
     def is_short(self) -> bool:
         """True if data should be deleted."""
-        return self.disk_bytes + self.inside_bytes < self.least_bytes
+        return self.disk_bytes + self.inside_bytes + self.log_bytes < self.least_bytes
 
 
 def room(store: Store, free_bytes: int) -> Room:
@@ -88,7 +92,8 @@ def room(store: Store, free_bytes: int) -> Room:
     """
     disk = shutil.disk_usage(store.path.parent)
     inside = store.pragma("freelist_count") * store.pragma("page_size")
-    return Room(disk.free, inside, min(free_bytes, round(LOW_SHARE * disk.total)))
+    log = max(0, log_bytes(store.path) - KEPT_BYTES)
+    return Room(disk.free, inside, log, min(free_bytes, round(LOW_SHARE * disk.total)))
 
 
 class Retention:

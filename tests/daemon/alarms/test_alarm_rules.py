@@ -98,9 +98,14 @@ def opened(seconds_ago: int) -> OpenSessionRow:
 
 
 def store_health(
-    state: HealthState = "ok", text: str = "", free_bytes: int | None = None, *, is_low: bool = False
+    state: HealthState = "ok",
+    text: str = "",
+    free_bytes: int | None = None,
+    *,
+    is_low: bool = False,
+    log_reader: str | None = None,
 ) -> StoreHealth:
-    return StoreHealth(state, text, NOW, free_bytes, is_low)
+    return StoreHealth(state, text, NOW, free_bytes, is_low, log_reader)
 
 
 def missing(lately: int, share: float) -> GapCount:
@@ -348,6 +353,9 @@ CASES: dict[str, list[tuple[Evidence, list[str], Evidence]]] = {
             ["backup"],
             known(keeping=KeepingState(has_backups=True, newest_backup_utc_ns=NOW.utc_ns - 86_400 * NS_PER_S)),
         ),
+    ],
+    "store_log_grows": [
+        (known(store=store_health(log_reader="process 7 (python3)")), ["store"], known(store=store_health())),
     ],
     "disk_nearly_full": [
         (known(store=store_health(is_low=True)), ["store"], known(store=store_health(free_bytes=10**10))),

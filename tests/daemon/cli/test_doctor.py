@@ -211,6 +211,11 @@ def test_the_remedy_for_a_station_follows_its_state(status: str, remedy: str) ->
     assert ("aim" in found.remedy) == (status == "not_locked")
 
 
+def test_a_station_that_is_not_level_is_to_be_levelled() -> None:
+    station = {"name": "station", "age_s": 1.0, "status": "not_available", "sentence": "not level", "tilt_ok": False}
+    assert only(told(stations=[station]), "station station").remedy.startswith("level it")
+
+
 def test_alarms_that_only_warn_are_no_fault() -> None:
     critical = {"kind": "link_down", "subject": "boom", "severity": "critical"}
     warning = {"kind": "disk_low", "subject": "disk", "severity": "warning"}

@@ -134,6 +134,18 @@ def test_clients_that_only_wait_do_not_lock_the_operator_out(tmp_path: Path) -> 
         assert answers(tmp_path / "s")
 
 
+def test_clients_that_read_no_answer_do_not_lock_the_operator_out(tmp_path: Path) -> None:
+    said = json.dumps({"command": "echo", "args": {"a": "x" * 50_000}}).encode() + b"\n"
+    with serving(tmp_path / "s", give_way_s=0.1, send_s=DEADLINE_S), contextlib.ExitStack() as stack:
+        for _ in range(32):
+            client = stack.enter_context(connected(tmp_path / "s"))
+            client.setblocking(False)
+            with contextlib.suppress(BlockingIOError):
+                while client.send(said):  # until the answers that nobody reads keep the server from reading on
+                    pass
+        wait("a place", lambda: answers(tmp_path / "s"))
+
+
 def test_an_idle_client_is_closed(tmp_path: Path) -> None:
     with serving(tmp_path / "s", idle_s=0.2), connected(tmp_path / "s") as idle:
         assert idle.recv(1) == b""

@@ -97,13 +97,15 @@ def test_a_command_gets_an_email_on_its_input_and_its_failure_is_told(
         pace=replace(FAST, first_retry_s=0.3), command=[program, "someone@example.com; touch /tmp/not-a-shell"]
     )
     now = sender.clock.now()
-    sender.notices.take(Notice("raised", "job_failed", "7", "warning", "zu wenig Übung", "Mehr messen.", now, now))
+    long = "Mehr messen. " + "Ü" * 600
+    sender.notices.take(Notice("raised", "job_failed", "7", "warning", "zu wenig Übung", long, now, now))
     wait_until(lambda: bool(sender.notices.faults()))
     assert sender.notices.faults() == {"command": f"{program} ended with status 75: no route to host"}
     wait_until(lambda: not sender.notices.faults())
     message = email.message_from_bytes(mail.read_bytes(), policy=email.policy.default)
     assert str(message["Subject"]).endswith("WARNING job_failed 7")
-    assert "zu wenig Übung. Mehr messen." in message.get_content()
+    assert f"zu wenig Übung. {long}" in message.get_content()
+    assert max(map(len, mail.read_bytes().splitlines())) <= 998, "RFC 5322"
     assert Path(f"{mail}.to").read_text(encoding="utf-8") == "someone@example.com; touch /tmp/not-a-shell\n"
 
 

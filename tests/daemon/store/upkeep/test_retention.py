@@ -14,7 +14,7 @@ import pytest
 from daemon.store import Reader, Store
 from daemon.store.upkeep import retention
 from daemon.store.upkeep.housekeeping import Housekeeping, Keeping
-from daemon.store.upkeep.retention import Retention, cutoff_ns, room
+from daemon.store.upkeep.retention import Retention, Room, cutoff_ns, room
 from drivers.clock import NS_PER_S, ManualClock, Stamp
 from drivers.readings import Capture, Fix, Reading
 from tests.daemon.support.damage import small_disk
@@ -250,6 +250,22 @@ def test_freed_pages_are_used_again_and_are_room(path: Path, store: Store) -> No
     assert room(store, 2**30).inside_bytes > before.inside_bytes
     fill(store, 200, begin_s=DAY_S)
     assert store.pragma("page_count") <= pages + 5
+
+
+def test_a_log_that_a_reader_keeps_is_no_reason_to_delete(
+    path: Path, store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(retention, "KEPT_BYTES", 0)
+    fill(store, 100)
+    with Reader(path) as reader:
+        left_open = reader.captures("boom")
+        next(left_open)
+        before = room(store, 2**30)
+        fill(store, 100, begin_s=DAY_S)
+        after = room(store, 2**30)
+    grown = after.log_bytes - before.log_bytes
+    assert grown > 0
+    assert not Room(0, 0, after.log_bytes, grown).is_short
 
 
 def test_deleting_reads_by_indexes(store: Store) -> None:
