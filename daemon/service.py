@@ -342,8 +342,12 @@ class Daemon:
             self._sessions.on_records(records)  # feeds the joiner, which the tip reads
         finally:
             if self._tip.on_records(records):  # also where no observation can be made: an encoder may have jumped
-                self._sessions.pending.once_stored(self._live_model.changed)
+                self._sessions.pending.once_stored(self._reload)
             self._guide.on_records(records)
+
+    def _reload(self) -> None:
+        if self._store.stores_events:  # otherwise nothing would be known of the jump
+            self._live_model.changed()
 
 
 def _stop_part(stop: Callable[[], None]) -> None:

@@ -232,8 +232,8 @@ class Acquisition:
             self._board.set_error(f"the writer failed: {error}; restart rigcal")
             self._failure = error
 
-    def _note_alive(self, read_until: Stamp) -> None:
-        self._try("the heartbeat", partial(self._store.note_alive, read_until))
+    def _note_alive(self, until: Stamp) -> None:
+        self._try("the heartbeat", partial(self._store.note_alive, until))
 
     def _take_in(self, now: Stamp) -> Stamp:
         """Commit the links' captures, and wait while the disk is full or faulty; captures queue meanwhile.
@@ -252,7 +252,7 @@ class Acquisition:
         if len(items) > BATCH_CAPTURES:
             items = in_time_order(queues)
         self._unstored = sum(isinstance(item, CanCapture | SerialCapture) for item in items)
-        batches = self._insist(partial(self._commit_raw, items))
+        batches = self._insist(partial(self._store.despite_damage, partial(self._commit_raw, items)))
         self._unstored = 0
         for batch in batches:
             self._board.captured(batch.captures)
@@ -268,10 +268,10 @@ class Acquisition:
         """
         if self._decoded is None and not self._try("decoded records", partial(self._decode, now)):
             return False
-        decoded = self._decoded
-        if decoded is None:
+        if (decoded := self._decoded) is None:
             return True
-        if not self._try("decoded records", partial(self._commit_records, decoded.records, decoded.chunk_ids)):
+        commit = partial(self._commit_records, decoded.records, decoded.chunk_ids)
+        if not self._try("decoded records", partial(self._store.despite_damage, commit)):
             return False
         self._decoded = None
         if not self._is_left_over:  # records of an earlier run do not show the present state
@@ -279,18 +279,20 @@ class Acquisition:
         return True
 
     def _decode(self, now: Stamp) -> None:
-        batch = self._backlog.next()
-        # Decoders are told the time only after they have been given all captures up to it.
-        is_tick = self._backlog.is_empty and now.monotonic_ns >= self._next_tick_ns
-        if batch is None and not is_tick:
+        waiting = self._backlog.first()
+        is_tick = now.monotonic_ns >= self._next_tick_ns
+        if waiting is None and not is_tick:
             return
-        is_left_over = batch is not None and batch.is_left_over
+        is_left_over = waiting is not None and waiting.is_left_over
         if is_left_over != self._is_left_over:
             self._tell_of_left_overs(is_left_over=is_left_over)
-        batch = batch or Batch((), ())
+        batch = waiting or Batch((), ())
         records = [*batch.failures, *self._decoding.feed(batch.captures)]
+        if waiting is not None:
+            self._backlog.remove(waiting)
         until = _end(batch.captures)
-        if is_tick and not is_left_over:
+        # Decoders are told the time only after they have been given all captures up to it.
+        if is_tick and self._backlog.is_empty and not is_left_over:
             records += self._decoding.tick(now)
             self._next_tick_ns = now.monotonic_ns + TICK_NS
             until = now
@@ -298,13 +300,13 @@ class Acquisition:
         self._hand_on(self._decoded.told)
 
     def _tell_of_left_overs(self, *, is_left_over: bool) -> None:
-        self._is_left_over = is_left_over
         if is_left_over:
             log.warning("decoding captures that the last run left undecoded")
         else:
             self._decoding = self._new_decoding()  # live captures are decoded separately from those left over
             self._recall()
             log.info("all captures of the last run are decoded")
+        self._is_left_over = is_left_over
 
     def _new_decoding(self) -> LinkDecoders:
         """Return decoders that start from the stored states of the devices."""

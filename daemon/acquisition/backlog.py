@@ -51,7 +51,7 @@ class Backlog:
         self._batches: deque[Batch] = deque()
         self._held = 0
         self._reports: list[Record] = []  # reports of batches that are not in memory
-        self._last_id = 0  # chunks up to this id have been returned
+        self._last_id = 0  # chunks up to this id have been removed
         self._left_over_until = store.newest_undecoded()
         self._is_in_store = self._left_over_until > 0
 
@@ -62,7 +62,7 @@ class Backlog:
 
     @property
     def is_empty(self) -> bool:
-        """True when all stored captures have been returned."""
+        """True when all stored captures have been removed."""
         return not self._batches and not self._is_in_store
 
     def add(self, batch: Batch) -> None:
@@ -74,26 +74,29 @@ class Backlog:
         self._batches.append(batch)
         self._held += len(batch.captures)
 
-    def next(self) -> Batch | None:
-        """Remove and return the oldest batch; None if there is none.
+    def first(self) -> Batch | None:
+        """Return the oldest batch, which stays until it is removed; None if there is none.
 
         Raises:
             sqlite3.OperationalError: the disk cannot be read at present.
         """
         if self._batches:
-            batch = self._batches.popleft()
-            self._held -= len(batch.captures)
-        elif self._is_in_store:
-            batch = self._read()
-            if not batch.chunk_ids:
-                self._is_in_store = False
-                if not batch.reports:
-                    return None
-                self._reports = []
-        else:
+            return self._batches[0]
+        if not self._is_in_store:
             return None
-        self._last_id = max([self._last_id, *batch.chunk_ids])
+        batch = self._read()
+        if not batch.chunk_ids and not batch.reports:
+            self._is_in_store = False
+            return None
         return batch
+
+    def remove(self, batch: Batch) -> None:
+        """Remove the batch that `first` has returned last, because it is decoded."""
+        if self._batches:
+            self._held -= len(self._batches.popleft().captures)
+        elif not batch.chunk_ids:
+            self._is_in_store, self._reports = False, []
+        self._last_id = max([self._last_id, *batch.chunk_ids])
 
     def _read(self) -> Batch:
         ids = self._store.undecoded_chunks(self._last_id, BATCH_CAPTURES)

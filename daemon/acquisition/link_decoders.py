@@ -104,11 +104,12 @@ class LinkDecoders:
         return self._decoders[link]
 
     def _make(self, link: str, at: Stamp) -> list[DeviceEvent]:
-        decoder = self._decoders[link] = self._factories[link]()
-        self._boots[link] = at.boot_id
-        if not isinstance(decoder, CanDecoder):
-            return []
-        return decoder.recall(event for event in self._recalled(at) if self._links.get(event.device, link) == link)
+        decoder, recalled = self._factories[link](), list[DeviceEvent]()
+        if isinstance(decoder, CanDecoder):
+            states = self._recalled(at)  # may raise: then no decoder is made
+            recalled = decoder.recall(event for event in states if self._links.get(event.device, link) == link)
+        self._decoders[link], self._boots[link] = decoder, at.boot_id
+        return recalled
 
     @cached_property
     def _links(self) -> dict[str, str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sqlite3
 from collections.abc import Callable, Sequence
 
 from drivers.clock import NS_PER_S, Stamp
@@ -24,8 +25,11 @@ class Thinning:
         self._kept: dict[tuple[type[Record], str], Reading | Fix] = {}
 
     def kept(self, records: Sequence[Record]) -> list[Record]:
-        """Return the records to store, in order."""
-        return [record for record in records if self._is_kept(record)]
+        """Return the records to store, in order; all of them if the sessions cannot be read at present."""
+        try:
+            return [record for record in records if self._is_kept(record)]
+        except sqlite3.Error:
+            return list(records)
 
     def _is_kept(self, record: Record) -> bool:
         if isinstance(record, Reading):

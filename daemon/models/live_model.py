@@ -23,6 +23,7 @@ log = logging.getLogger(__name__)
 
 NO_MODEL = "no model is live; `rigcal model list` shows the candidates"
 LOADING = "the live model is being loaded"
+JUMPED = "the reading of a joint has jumped; the live model is not used before that is stored"
 RETRY_S = 30.0  # after a failed load
 STOP_TIMEOUT_S = 5.0
 
@@ -132,9 +133,9 @@ class LiveModel(WorkerThread):
             self._changed.set()
 
     def void(self) -> None:
-        """Use the model no more until `changed` is called, because what will change is not stored yet."""
+        """Use the model no more until `changed` is called, because a jump of a joint's reading is not stored yet."""
         with self._turn:
-            self._state, self._is_void = Missing(LOADING), True
+            self._state, self._is_void = Missing(JUMPED), True
 
     def load(self, row: ModelRow) -> CalibratedModel:
         """Read a model of the store; a child process loaded it successfully when it was written.

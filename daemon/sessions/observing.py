@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import logging
+import sqlite3
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 
@@ -25,7 +26,7 @@ from daemon.sessions.prisms.standstill_places import (
     change_size,
 )
 from daemon.sessions.station_setups import AXES, Place
-from daemon.store.errors import is_unwritable
+from daemon.store.errors import is_damage, is_unwritable
 from daemon.store.queries.observations import OF_CONTROL_POINT, ObservationTable, last_standstills, newest_observation
 from daemon.store.store import Store
 from drivers.clock import Stamp, lies_within
@@ -65,7 +66,8 @@ class PendingWrites:
         """Make all changes, which are pending until they are committed; log and discard one that can never be made.
 
         Raises:
-            sqlite3.DatabaseError: the store cannot be written at present.
+            sqlite3.DatabaseError: the store cannot be written at present, or is damaged where changes are to be made,
+                which are discarded; the transaction must be repeated without them.
         """
         if writes := [*self._writes]:
             with self._store.transaction():
@@ -84,14 +86,27 @@ class PendingWrites:
         except Exception as error:
             if is_unwritable(error):
                 raise
-            if len(writes) == 1:
+            if len(writes) > 1:
+                self._make_singly(writes)
+            elif is_damage(error):  # nothing of this transaction can be committed
+                self._writes.remove(writes[0])
+                log.error(_LEFT_OUT, exc_info=error)
+                raise
+            else:
                 # Log only once committed: if the disk then refuses the others, this change is retried with them.
                 self._store.once_committed(partial(log.error, _LEFT_OUT, exc_info=error))
-                return
-        else:
-            return
+
+    def _make_singly(self, writes: Sequence[Callable[[], object]]) -> None:
+        damage: sqlite3.DatabaseError | None = None
         for write in writes:
-            self._make([write])
+            try:
+                self._make([write])
+            except sqlite3.DatabaseError as error:
+                if not is_damage(error):
+                    raise
+                damage = error
+        if damage is not None:
+            raise damage
 
 
 class ObservationMaker:

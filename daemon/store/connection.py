@@ -261,6 +261,18 @@ class Connection:
             log.error("%s: %s", self.path, error)
             return otherwise
 
+    def despite_damage(self, work: Callable[[], T]) -> T:
+        """Return the result of `work`, which is repeated once if it met damage and leaves out by then what met it.
+
+        A transaction that has met damage cannot be committed any more, whatever else it contains.
+        """
+        try:
+            return work()
+        except sqlite3.DatabaseError as error:
+            if not is_damage(error):
+                raise
+            return work()
+
     def number(self, sql: str, parameters: Sequence[object]) -> int | None:
         """Return the integer in the first column of a query's first row; None if there is no row."""
         found = self.rows(sql, parameters)

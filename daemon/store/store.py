@@ -74,6 +74,7 @@ class Store(Connection):
         self._links: dict[str, int] = {}
         self._channels: dict[tuple[str, str], tuple[int, ChannelKind]] = {}
         self._joints: frozenset[str] = frozenset()
+        self._left_out: set[str] = set()  # statements that have met damage
         self.run_id = 0
         self.begun: Stamp | None = None
         self.previous_end: Stamp | None = None
@@ -299,15 +300,25 @@ class Store(Connection):
                     self._insert_rows(db, statement, rows)
 
     def _insert_rows(self, db: Database, statement: str, rows: Sequence[SqlRow]) -> None:
-        """Insert rows; damage of the tables of gaps or events must not prevent captures from being stored."""
+        """Insert rows; damage of the tables of gaps or events must not prevent captures from being stored.
+
+        It prevents the commit of this transaction. From then on nothing is inserted into the damaged table.
+        """
+        if statement in self._left_out:
+            return
         try:
             db.conn.executemany(statement, rows)
         except sqlite3.DatabaseError as error:
-            if statement not in (_GAPS, _EVENTS) or not is_damage(error):
-                raise
-            if not self.damage:
-                log.error("%s: damaged, so gaps and events may not be stored: %s", self.path, error)
-            self.note_damage(error)
+            if statement in (_GAPS, _EVENTS) and is_damage(error):
+                self._left_out.add(statement)
+                what = "gaps" if statement == _GAPS else "events of devices"
+                log.error("%s: damaged, so %s are not stored any more: %s", self.path, what, error)
+            raise
+
+    @property
+    def stores_events(self) -> bool:
+        """False once events of devices cannot be stored because their table is damaged."""
+        return _EVENTS not in self._left_out
 
     def newest_events(self, most: int) -> list[dict[str, Any]]:
         """Return device, utc_ns, kind and text of the newest device events, newest first."""

@@ -1,10 +1,11 @@
 """The daemon's parts hear of what was stored, whatever one of them does with it."""
 
+from dataclasses import replace
 from pathlib import Path
 
 from daemon.composition import Parts, joiner
 from daemon.service import Daemon
-from daemon.store.store import Store
+from daemon.store.store import _EVENTS, Store
 from drivers.can.tip_frames import TipStatus
 from drivers.clock import ManualClock
 from drivers.readings import DeviceEvent, EventKind, Fix, LockState, Reading, Record, Status
@@ -66,6 +67,12 @@ def test_there_is_no_tip_from_a_jump_on_whatever_cannot_be_stored_or_is_stored_l
         keep(records)
         wait(lambda: status() is not TipStatus.NO_MODEL)
         assert status() is TipStatus.ZERO_LOST
+        daemon._models.zeros_checked_command({"operator": "Ada"})
+        wait(lambda: status() is TipStatus.OK)
+        store._left_out.add(_EVENTS)  # as after damage of their table
+        keep(read(replace(jump, stamp=clock.now())))
+        assert status() is TipStatus.NO_MODEL, "the store cannot tell that a joint has jumped"
+        assert "not used before that is stored" in daemon._tip.tip("r").reason
     finally:
         daemon.close()
         store.close()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sqlite3
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -11,10 +12,11 @@ import pytest
 
 from daemon.acquisition import acquisition as acquisition_module
 from daemon.acquisition.acquisition import Acquisition
+from daemon.acquisition.link_decoders import LinkDecoders
 from daemon.acquisition.thinning import Thinning
 from drivers.readings import CanCapture, Capture, Reading, Record
 from tests.daemon.support.acquisition import wait_until
-from tests.daemon.support.damage import fill_up, make_room
+from tests.daemon.support.damage import fill_up, make_room, tear
 from tests.daemon.support.sessions import SOURCE, STEP_S, Rig
 from tests.daemon.support.store import table
 
@@ -123,6 +125,46 @@ def unobserved(rig: Rig) -> list[int]:
     observed = [row["fix_id"] for row in table(rig.store.path, "observations")]
     assert len(set(observed)) == len(observed)
     return [number for number, fix_id in enumerate(fixes[:-10]) if fix_id not in observed]
+
+
+def test_damage_of_the_observations_keeps_neither_readings_nor_fixes_from_being_stored(session_rig: Rig) -> None:
+    path = session_rig.store.path
+    session_rig.say("start", prism="r")
+    session_rig.live(3.0)
+    session_rig.store.close()
+    tear(path, "observations_by_fix")
+    session_rig.open_store(path)
+    fixes = len(table(path, "fixes"))
+    measured: list[list[Record]] = []
+    capture(session_rig, measured, 80)
+    acquisition = decoding(session_rig, measured)
+    wait_until(lambda: not session_rig.store.undecoded_chunks())
+    assert acquisition.stop()
+    assert len(table(path, "fixes")) == fixes + 80
+    assert not session_rig.keeper.pending._writes
+    assert session_rig.store.damage
+
+
+def test_a_batch_that_cannot_be_decoded_because_of_the_disk_is_decoded_a_moment_later(session_rig: Rig) -> None:
+    session_rig.say("start", prism="r")
+    measured: list[list[Record]] = []
+    capture(session_rig, measured, 80)
+    faults = iter([sqlite3.OperationalError("disk I/O error")])
+
+    class Failing(LinkDecoders):
+        def feed(self, captures: Sequence[Capture]) -> list[Record]:
+            for fault in faults:
+                raise fault
+            return super().feed(captures)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(acquisition_module, "LinkDecoders", Failing)
+        patch.setattr(acquisition_module, "RETRY_S", 0.05)
+        acquisition = decoding(session_rig, measured)
+        wait_until(lambda: not session_rig.store.undecoded_chunks())
+        assert acquisition.stop()
+    assert len(table(session_rig.store.path, "fixes")) == 80
+    assert next(faults, None) is None
 
 
 def a_full_disk(rig: Rig, measured: Sequence[Sequence[Record]]) -> Acquisition:

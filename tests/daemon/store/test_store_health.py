@@ -25,7 +25,7 @@ from daemon.service import Daemon
 from daemon.store import Reader, Store, StoreError
 from daemon.store.files import FileIdentity
 from drivers.clock import SystemClock
-from drivers.readings import Capture, DeviceEvent, EventKind
+from drivers.readings import DeviceEvent, EventKind, LinkItem
 from tests.daemon.support.acquisition import ListLink, wait_until
 from tests.daemon.support.damage import fill, small_disk, tear
 from tests.daemon.support.idle_daemon import running as run_daemon
@@ -213,7 +213,7 @@ def test_a_disk_that_fills_up_is_seen_before_it_is_full(tmp_path: Path) -> None:
 
 
 @contextlib.contextmanager
-def running(tmp_path: Path, captures: Sequence[Capture] = ()) -> Iterator[tuple[Config, Daemon]]:
+def running(tmp_path: Path, captures: Sequence[LinkItem] = ()) -> Iterator[tuple[Config, Daemon]]:
     config = Config(rig="swdt82", state_directory=tmp_path)
     rig = SOURCE.rig
     store = Store(config.store_path)
@@ -289,13 +289,16 @@ def test_a_damaged_table_of_alarms_keeps_no_daemon_from_starting(tmp_path: Path)
     "names",
     [
         ("gaps", "sqlite_autoindex_gaps_1"),
+        ("device_events",),
+        ("device_events_of_states",),
         ("daemon_runs",),
         ("calibration_sessions", "calibration_sessions_one_open"),
         ("jobs", "jobs_by_state"),
     ],
 )
 def test_a_damaged_table_keeps_no_daemon_from_starting_and_acquiring(tmp_path: Path, names: tuple[str, ...]) -> None:
-    frames = [frame(number, float(number)) for number in range(3)]
+    opened = DeviceEvent("boom", at(0.0), EventKind.LINK_UP, "boom: open")
+    frames = [opened, *(frame(number, float(number)) for number in range(3))]
     with running(tmp_path, frames) as (config, _):
         wait_until(lambda: len(table(config.store_path, "raw_chunks")) > 0)
         request(config.socket_path, "setup.new", {"id": "S1"})

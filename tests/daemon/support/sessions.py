@@ -58,13 +58,17 @@ class Rig:
 
     def __init__(self, path: Path) -> None:
         self.clock, self._steps = SharedClock(), 0
-        self.store = Store(path)
-        self.store.begin_run(self.clock.now())
-        self.store.declare_channels({j.name: j.unit for j in SOURCE.rig.joints}, {})
         self.values = {j.name: sum(j.limits) / 2 for j in SOURCE.rig.joints}
         self.target_mm = (3000.0, 8000.0, 1000.0)
         self.aimed: list[str] = []
         self.clock_state: ClockState | None = None  # of the computer
+        self.open_store(path)
+
+    def open_store(self, path: Path) -> None:
+        """Begin a run of the daemon on a store."""
+        self.store = Store(path)
+        self.store.begin_run(self.clock.now())
+        self.store.declare_channels({j.name: j.unit for j in SOURCE.rig.joints}, {})
         self.setups = StationSetups(SOURCE.rig, self.store, self.clock, SessionsSection().control_tolerance_mm)
         self.keeper = self.new_keeper()
 
