@@ -112,7 +112,7 @@ class CanDecoder:
         if self._rates.is_due(now):
             with self._lock:
                 self._rates.mark(now, {key: entry.count for key, entry in self._entries.items()})
-        records: list[Record] = []
+        records: list[Record] = [*self._bus_errors.tick(now)]
         for channel in self._channels:
             channel.tick(now, records)
         for node in self._nodes:

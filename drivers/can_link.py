@@ -111,8 +111,9 @@ class CanLink:
     def publish(self, frames: Sequence[Frame]) -> None:
         """Send rigcal's own frames at the next opportunity; may be called from any thread.
 
-        Only the frames of the newest call are kept, and they are discarded when the bus is opened, so that outdated
-        frames are never sent.
+        Only the frames of the newest call are kept, and they are discarded when the bus is opened, so that no outdated
+        frame is passed to the adapter. Frames that the adapter or the kernel holds while the bus is disturbed may be
+        sent late, see docs/explanation/limits.md.
 
         Raises:
             TransmitForbiddenError: the link is listen-only, or an identifier is not one of its own. Nothing is sent.

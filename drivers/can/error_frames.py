@@ -10,6 +10,9 @@ from drivers.readings import DeviceEvent, EventKind
 ERROR_REPEAT_NS = 10 * NS_PER_S
 """Minimum interval between reports of errors that do not change the controller's state; a report has their count."""
 
+STATE_REPEAT_NS = NS_PER_S
+"""Minimum interval between reports of the same state of the controller; a repeated state is reported after it."""
+
 # Error class, in the identifier
 _TX_TIMEOUT = 0x001
 _LOST_ARBITRATION = 0x002
@@ -59,7 +62,9 @@ class _Kind:
 class BusErrors:
     """Decoder of the error frames of one link.
 
-    The controller's state is reported when it changes. Other errors are reported the first time and then at most every
+    The controller's state is reported when it changes. A state other than error-active is reported again, at most every
+    STATE_REPEAT_NS, if it is announced again: meanwhile the controller may have worked, or the link may have been
+    reopened, which no error frame shows. Other errors are reported the first time and then at most every
     ERROR_REPEAT_NS, with their number since the last report.
 
     Attributes:
@@ -71,6 +76,8 @@ class BusErrors:
     link: str
     state: EventKind = EventKind.BUS_ERROR_ACTIVE
     count: int = 0
+    _told: Stamp | None = None
+    _again: DeviceEvent | None = None
     _errors: _Kind = field(default_factory=_Kind)
     _overflows: _Kind = field(default_factory=_Kind)
 
@@ -84,12 +91,12 @@ class BusErrors:
         """
         self.count += 1
         data = data.ljust(8, b"\0")
-        events: list[DeviceEvent] = []
+        events = self.tick(stamp)
         state = _state(error_class, data[1])
-        if state is not None and state is not self.state:
-            self.state = state
+        if state is not None:
             counters = f" (error counters: {data[6]} sending, {data[7]} receiving)" if data[6] or data[7] else ""
-            events.append(DeviceEvent(self.link, stamp, state, f"{self.link}: {_STATE_TEXTS[state]}{counters}"))
+            text = f"{self.link}: {_STATE_TEXTS[state]}{counters}"
+            events += self._announced(DeviceEvent(self.link, stamp, state, text))
         if error_class & _CONTROLLER and data[1] & (_RX_OVERFLOW | _TX_OVERFLOW):
             what = "received" if data[1] & _RX_OVERFLOW else "transmitted"
             text = f"the controller's buffer of {what} frames overflowed"
@@ -98,6 +105,25 @@ class BusErrors:
         if errors:
             self._report(self._errors, EventKind.BUS_ERROR, stamp, ", ".join(errors), events)
         return events
+
+    def tick(self, now: Stamp) -> list[DeviceEvent]:
+        """Return the report of a repeated state when it is due."""
+        if self._again is None or self._told is None or now.since(self._told) < STATE_REPEAT_NS:
+            return []
+        event, self._again = self._again, None
+        self._told = self._told.shifted(STATE_REPEAT_NS)
+        return [event]
+
+    def _announced(self, event: DeviceEvent) -> list[DeviceEvent]:
+        """Return the event of a state that the controller announces, unless it was reported a short time ago."""
+        is_repeated, self.state, self._again = event.kind is self.state, event.kind, None
+        if is_repeated and event.kind is EventKind.BUS_ERROR_ACTIVE:
+            return []
+        if is_repeated and self._told is not None and event.stamp.since(self._told) < STATE_REPEAT_NS:
+            self._again = event
+            return []
+        self._told = event.stamp
+        return [event]
 
     def _report(self, kind: _Kind, event: EventKind, stamp: Stamp, text: str, events: list[DeviceEvent]) -> None:
         kind.count += 1

@@ -42,6 +42,7 @@ Interface = Literal["socketcan", "virtual", "udp_multicast", "slcan"]
 ADAPTER_READY_S = 1.2  # wait after opening the port, as some slcan adapters restart then; opening takes under 2 s
 BATCH_MAX = 512  # frames per read, so that a flooded bus cannot keep the loop from its other duties
 CLOSE_WRITE_S = 1.0  # longest wait for an slcan adapter to accept the command that closes its channel
+OUTDATED_S = 0.05  # frames that the terminal of an slcan adapter has held for longer are discarded
 GATHER_S = 0.005  # frames this soon after the first are read together with it, as each wake-up costs as much as a few
 
 # Linux, include/uapi/asm-generic/socket.h; Python's socket module does not name them
@@ -370,6 +371,7 @@ class SlcanPort(CanPort):
         fcntl.ioctl(self._fd, termios.TIOCEXCL)
         self._lines = SlcanLines()
         self._unwritten = b""  # end of a line that the terminal has accepted only in part
+        self._emptied_s = time.monotonic()  # when the adapter was last seen to have taken all lines
 
     def fileno(self) -> int:
         return self._fd
@@ -390,7 +392,16 @@ class SlcanPort(CanPort):
         return Batch([Received(frame, None) for frame in frames], not more_may_wait(data))
 
     def _send(self, message: can.Message) -> None:
-        """Write the frame's line without waiting; python-can waits, however long, until the adapter has taken it."""
+        """Write the frame's line without waiting; python-can waits, however long, until the adapter has taken it.
+
+        Lines that the adapter has not taken in time are discarded, as they would be outdated when it goes on.
+        """
+        if not self._serial.out_waiting:
+            self._emptied_s = time.monotonic()
+        elif time.monotonic() - self._emptied_s > OUTDATED_S:
+            fcntl.ioctl(self._fd, termios.TCFLSH, termios.TCOFLUSH)
+            self._unwritten = b"\r"  # ends a line of which the adapter has taken a part
+            raise BlockingIOError(errno.EAGAIN, os.strerror(errno.EAGAIN))
         self._unwritten = self._unwritten[os.write(self._fd, self._unwritten) :]
         if self._unwritten:
             raise BlockingIOError(errno.EAGAIN, os.strerror(errno.EAGAIN))

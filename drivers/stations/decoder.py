@@ -23,7 +23,8 @@ from drivers.stations.config import StationConfig
 from drivers.stations.replies import Reply
 from drivers.stations.survey import position_mm, range_checked
 
-_UNFINISHED_NS = 2 * NS_PER_S  # an unfinished record is discarded after this; the slowest takes 0.6 s at 1200 baud
+_UNFINISHED_NS = 2 * NS_PER_S  # an unfinished record is discarded after this, even if no more bytes arrive
+_PAUSE_NS = 150 * NS_PER_S // 1000  # a record has no longer pause; a port takes longer to be reopened (SETTLE_S)
 
 Point = tuple[float, float, float]
 
@@ -34,6 +35,9 @@ class StationDecoder:
     A fix is stamped with the arrival of its first byte; if that time is doubtful, the fix may not be used. Transmitted
     captures give no records. Records caused by the passing of time are stamped with the instant at which they were due,
     so they do not depend on how often `tick` is called.
+
+    Bytes that arrive after a pause do not complete a record that was begun before it: the adapter may have been
+    unplugged in between, and the halves of two records may look like one.
 
     Args:
         config: configuration of the station, the same as its link's.
@@ -51,6 +55,9 @@ class StationDecoder:
             return []
         records = self.tick(capture.stamp)
         if not capture.is_transmitted:
+            if self._last_byte is not None and capture.stamp.since(self._last_byte) > _PAUSE_NS:
+                for reply in self._reader.flush("incomplete record"):
+                    records += reply.records
             self._last_byte = capture.stamp
         for reply in self._reader.feed(capture):
             records += self._records(reply)

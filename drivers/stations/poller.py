@@ -102,6 +102,7 @@ class Poller:
         self._outbox: deque[bytes] = deque(encode(command) for command in plan.opening)
         self._commands: deque[bytes] = deque(plan.setup)
         self._setting_up = bool(plan.setup)
+        self._is_set_up = False  # the station has acknowledged its set-up since its last record
         self._acknowledged: list[str] = []
         self._unanswered: set[bytes] = set()
         self._asked: _Asked | None = None
@@ -184,6 +185,7 @@ class Poller:
 
     def _finish_setup(self) -> None:
         self._setting_up = False
+        self._is_set_up = bool(self._acknowledged)
         if self._acknowledged:
             self._notices.append((EventKind.CONFIGURED, f"station acknowledged {', '.join(self._acknowledged)}"))
         self._acknowledged = []
@@ -202,6 +204,9 @@ class Poller:
         elif asked.acked is not None and now_ns >= self._deadline(asked):
             self._commands.extend(self._plan.recover)
             self._asked = None
+        elif asked.is_request and self._plan.streams and not self._is_set_up and now_ns >= self._deadline(asked):
+            self._asked = None
+            self._set_up_again()
         elif now_ns - asked.first_sent >= _ns(self._timing.give_up_s):
             self._give_up(asked)
 
@@ -214,9 +219,13 @@ class Poller:
             )
             self._notices.append((EventKind.INSTRUMENT_ERROR, text))
         self._asked = None
-        if asked.is_request:  # the station may have been switched off and have lost its settings
-            self._commands.extend(self._plan.setup)
-            self._setting_up = bool(self._plan.setup)
+        if asked.is_request:
+            self._set_up_again()
+
+    def _set_up_again(self) -> None:
+        """Set the station up before the next request: it may have been switched off and have lost its settings."""
+        self._commands.extend(self._plan.setup)
+        self._setting_up = bool(self._plan.setup)
 
     def _acked(self, now_ns: int) -> None:
         asked = self._asked
@@ -242,6 +251,7 @@ class Poller:
         if asked is None or not asked.is_request:
             return
         self._unanswered.clear()
+        self._is_set_up = False
         if self._plan.streams:
             asked.first_sent = asked.sent = now_ns
             return
@@ -254,4 +264,5 @@ def _ns(seconds: float) -> int:
 
 
 def _name(command: bytes) -> str:
-    return command.decode("ascii", errors="backslashreplace")
+    """Return a command as text: control characters as in the manuals, `11h`."""
+    return "".join(chr(byte) if 0x20 <= byte < 0x7F else f"{byte:02X}h" for byte in command)

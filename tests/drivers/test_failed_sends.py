@@ -7,11 +7,13 @@ import os
 import socket
 import struct
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import can
 import pytest
+import serial
 from can.interfaces.virtual import VirtualBus
 
 from drivers.can.frame import Frame
@@ -148,6 +150,39 @@ def test_an_slcan_adapter_that_accepts_lines_only_in_part_gets_their_ends_before
     finally:
         port.close()
     assert lines.removeprefix(b"O\r") == sent * b"t6A020102\r" + b"t0800\r"
+
+
+def test_frames_that_an_slcan_adapter_does_not_take_are_discarded_and_not_sent_when_it_goes_on(
+    adapter: Adapter, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # The kernel counts the bytes that a real adapter has not taken; it counts none for a pseudo-terminal
+    untaken = 0
+    monkeypatch.setattr(serial.Serial, "out_waiting", property(lambda _port: untaken))
+    port = open_port(
+        CanLinkConfig(
+            name="boom",
+            interface="slcan",
+            channel=str(adapter.path),
+            allow_transmit=True,
+            options={"sleep_after_open": 0},
+        )
+    )
+    try:
+        deadline_s = time.monotonic() + DEADLINE_S
+        assert port.send(Frame(0x680, b"\x01"))
+        untaken = 1
+        assert port.send(Frame(0x681, b"\x01")), "the adapter has had no time yet"
+        while port.send(Frame(0x681, b"\x02")):
+            adapter.waiting()
+            assert time.monotonic() < deadline_s, "lines pile up in the terminal"
+        assert not port.send(Frame(0x680, b"\x03"))
+        untaken = 0
+        assert port.send(Frame(0x680, b"\x04"))
+        assert port.send(Frame(0x681, b"\x04"))
+        before = adapter.commands(b"t681104\r").removesuffix(b"t680104\rt681104\r")
+        assert before == b"\r" or before.endswith(b"\r\r"), "a line end for the line that may have been cut"
+    finally:
+        port.close()
 
 
 def test_a_set_up_that_cannot_be_sent_is_cancelled_and_not_sent_later(adapter: Adapter) -> None:

@@ -93,10 +93,13 @@ def time_doubtful(evidence: Evidence) -> Iterator[Finding]:
 def decode_failures(evidence: Evidence) -> Iterator[Finding]:
     """In about the last minute, at least 10 captures of a device, and at least 1 % of them, could not be decoded.
 
-    Cleared when fewer have failed for a minute.
+    At least 3 are enough if none was decoded: a station that measures on request sends few. Cleared when fewer have
+    failed for a minute.
     """
     for device in evidence.acquisition.decoding:
-        if device.lately >= 10 and device.lately_share >= 0.01 and not evidence.is_cut_off(device.device):
+        are_many = device.lately >= 10 and device.lately_share >= 0.01
+        are_all = device.lately >= 3 and device.lately_share == 1.0
+        if (are_many or are_all) and not evidence.is_cut_off(device.device):
             yield device.device, f"captures cannot be decoded; most frequent reason: {kind_of(device.reason)}"
 
 

@@ -141,7 +141,9 @@ CASES: dict[str, list[tuple[Evidence, list[str], Evidence]]] = {
     ],
     "decode_failures": [
         (known(decoding=[failures(10, 0.02)]), ["theta1"], known(decoding=[failures(10, 0.005)])),
-        (known(decoding=[failures(60, 1.0)]), ["theta1"], known(decoding=[failures(9, 1.0)])),
+        (known(decoding=[failures(60, 0.9)]), ["theta1"], known(decoding=[failures(9, 0.9)])),
+        # a station that measures on request, and is not silent without records: a record in 20 s, all malformed
+        (known(decoding=[failures(3, 1.0)]), ["theta1"], known(decoding=[failures(2, 1.0)])),
     ],
     "decoder_defective": [
         (known(links=[link(decoder_failed_age_s=5)]), ["boom"], known(links=[link(decoder_failed_age_s=601)])),

@@ -5,7 +5,7 @@ import pytest
 from drivers.can.error_frames import BusErrors
 from drivers.can_decoder import CanDecoder
 from drivers.readings import CanCapture, DeviceEvent, EventKind
-from tests.drivers.can_support import at
+from tests.drivers.can_support import at, events
 
 
 def feed(errors: BusErrors, error_class: int, data: str = "", seconds: float = 0.0) -> list[DeviceEvent]:
@@ -36,6 +36,48 @@ def test_a_state_is_told_when_it_changes_and_only_then() -> None:
     assert [e.kind for e in feed(errors, 0x040)] == [EventKind.BUS_OFF]
     assert [e.kind for e in feed(errors, 0x100)] == [EventKind.BUS_ERROR_ACTIVE]
     assert errors.count == 5
+
+
+@pytest.mark.parametrize(("error_class", "data"), [(0x040, ""), (0x004, "0010")], ids=["bus-off", "passive"])
+def test_a_state_that_the_controller_enters_again_after_its_link_was_reopened_is_told_again(
+    error_class: int, data: str
+) -> None:
+    errors = BusErrors("boom")
+    (first,) = feed(errors, error_class, data)
+    (again,) = feed(errors, error_class, data, 5)
+    assert (again.kind, again.stamp) == (first.kind, at(5))
+
+
+def test_a_state_that_is_announced_again_within_a_second_is_told_when_the_second_is_over() -> None:
+    boom = CanDecoder("boom", [])
+    for seconds in (0, 0.3, 0.4):
+        told = list(boom.feed(CanCapture("boom", at(seconds), 0x040, b"", is_error=True)))
+        assert len(told) == (seconds == 0)
+    assert boom.tick(at(0.9)) == []
+    (again,) = events(boom.tick(at(1)))
+    assert (again.kind, again.stamp) == (EventKind.BUS_OFF, at(0.4))
+    assert boom.tick(at(9)) == []
+
+
+def test_a_state_that_is_announced_all_the_time_is_told_once_a_second_however_often_time_is_told() -> None:
+    def storm(*, tick: bool) -> list[DeviceEvent]:
+        errors = BusErrors("boom")
+        told = []
+        for n in range(995):
+            told += feed(errors, 0x004, "0010", n * 0.01)
+            told += errors.tick(at(n * 0.01 + 0.005)) if tick else []
+        return told
+
+    told = storm(tick=False)
+    assert len(told) == 10
+    assert storm(tick=True) == told
+
+
+def test_an_error_active_controller_is_told_once() -> None:
+    errors = BusErrors("boom")
+    feed(errors, 0x040)
+    assert [event.kind for event in feed(errors, 0x100, "", 1)] == [EventKind.BUS_ERROR_ACTIVE]
+    assert feed(errors, 0x100, "", 9) == errors.tick(at(20)) == []
 
 
 def test_error_counters_are_told() -> None:

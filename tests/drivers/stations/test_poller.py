@@ -341,10 +341,56 @@ def test_a_set_station_is_stopped_set_to_track_and_asked_once() -> None:
             (2, "received", SET_REPLY + b"\r\n"),
             (3, "received", SET_REPLY + b"\r\n"),
             (12.5, "received", SET_REPLY + b"\r\n"),
-            (22.5, "sent", b"\x11\r\n"),
         ],
     )
     assert list(poller.closing()) == [b"\x12\r\n"]
+
+
+def streaming(poller: Poller, more: list[Step]) -> None:
+    """Play a station that tracks and sends a record after 2 s, and then `more`."""
+    start: list[Step] = [
+        (0, "sent", b"\x12\r\n"),
+        (0, "sent", b"Xe\r\n"),
+        (0.1, "received", b"\x06"),
+        (0.8, "sent", b"\x11\r\n"),
+        (2, "received", SET_REPLY + b"\r\n"),
+    ]
+    play(poller, [*start, *more])
+
+
+def test_a_stream_that_stops_for_ten_seconds_is_set_up_again_because_the_station_may_have_restarted() -> None:
+    poller = sokkia("Xe")
+    streaming(
+        poller,
+        [
+            (12, "sent", b"Xe\r\n"),
+            (12.1, "received", b"\x06"),
+            (12.8, "sent", b"\x11\r\n"),
+            (14, "received", SET_REPLY + b"\r\n"),
+            (24, "sent", b"Xe\r\n"),
+        ],
+    )
+
+
+def test_a_station_that_sends_nothing_while_its_prism_is_lost_is_set_up_once_and_then_only_asked() -> None:
+    streaming(
+        sokkia("Xe"),
+        [
+            (12, "sent", b"Xe\r\n"),
+            (12.1, "received", b"\x06"),
+            (12.8, "sent", b"\x11\r\n"),
+            (22.8, "sent", b"\x11\r\n"),
+            (32.8, "sent", b"Xe\r\n"),  # as before: no answer for 20 s
+        ],
+    )
+
+
+def test_a_control_character_without_answer_is_reported_by_its_hexadecimal_code() -> None:
+    poller = sokkia()
+    play(poller, [(0, "sent", b"\x12\r\n"), *((10.0 * k, "sent", b"\x11\r\n") for k in range(3))])
+    ((kind, text),) = kinds(poller)
+    assert kind is EventKind.INSTRUMENT_ERROR
+    assert text.startswith("station did not answer 11h within 20 s")
 
 
 def test_a_set_station_without_a_repeating_mode_is_asked_for_every_fix() -> None:
