@@ -315,7 +315,9 @@ def decoders(config: Config, source: RigSource, files: ChannelFiles | None = Non
     made: dict[str, Callable[[], Decoder]] = {}
     for section in config.can:
         factories = decoder_factories(source.rig, files, section.name)
-        made[section.name] = partial(_can_decoder, section.name, factories)
+        made[section.name] = partial(
+            _can_decoder, section.name, factories, node_setups(source.rig, files, section.name)
+        )
         _check_identifiers(section.name, config.own_identifiers(section.name), factories)
     for station in config.station:
         made[station.name] = partial(StationDecoder, station)
@@ -357,8 +359,8 @@ def _check_identifiers(link: str, own: Sequence[int], factories: Sequence[Callab
             )
 
 
-def _can_decoder(link: str, factories: Sequence[Callable[[], ChannelDecoder]]) -> Decoder:
-    return CanDecoder(link, [factory() for factory in factories])
+def _can_decoder(link: str, factories: Sequence[Callable[[], ChannelDecoder]], setups: Sequence[NodeSetup]) -> Decoder:
+    return CanDecoder(link, [factory() for factory in factories], setups)
 
 
 def _parts(

@@ -10,6 +10,7 @@ from drivers.can.error_frames import BusErrors
 from drivers.can.j1939 import J1939Id
 from drivers.can.summary import CanSummary, IdSummary, RateWindow
 from drivers.canopen.cia301 import Service, classify
+from drivers.canopen.node_setup import NodeSetup
 from drivers.canopen.pdo_channel import PdoChannelDecoder
 from drivers.canopen.supervision import NodeSupervision
 from drivers.canopen.sync import SYNC_ID, SyncSampling
@@ -34,9 +35,10 @@ class CanDecoder:
     Args:
         link: name of the link.
         channels: decoders of its channels. The nodes of CANopen channels are supervised (see NodeSupervision).
+        setups: set-ups of these nodes; of several for one node the last one counts, as for `CanLink`.
     """
 
-    def __init__(self, link: str, channels: Iterable[ChannelDecoder]) -> None:
+    def __init__(self, link: str, channels: Iterable[ChannelDecoder], setups: Iterable[NodeSetup] = ()) -> None:
         self._link = link
         self._entries: dict[int, _Entry] = {}
         self._lock = threading.Lock()  # held while `_entries` grows, `_rates` changes, or either is copied
@@ -55,8 +57,9 @@ class CanDecoder:
             entry.channels = (*entry.channels, state)
             if isinstance(decoder, PdoChannelDecoder):
                 nodes.setdefault(decoder.node, []).append(decoder)
+        expected = {setup.node: setup for setup in setups}
         for node, decoders in nodes.items():
-            supervision = NodeSupervision(node, decoders)
+            supervision = NodeSupervision(node, decoders, expected.get(node))
             self._nodes.append(supervision)
             for arbitration_id, handler in supervision.handlers.items():
                 self._entry(arbitration_id, False).handler = handler

@@ -65,7 +65,7 @@ class Status(StrEnum):
     OK = "ok"
     NOT_AVAILABLE = "not_available"  # the device itself sent "no value" (all ones, Exxx, distance 0)
     OUT_OF_RANGE = "out_of_range"  # outside the device's measuring range or the signal's declared range
-    DEVICE_ALARM = "device_alarm"  # the device reports an alarm (6503h, EMCY) that makes its value invalid
+    DEVICE_ALARM = "device_alarm"  # an alarm (6503h, EMCY) makes the value invalid, or a set-up found a wrong device
     MALFORMED = "malformed"  # received but could not be decoded; a DecodeFailure gives the reason
     TIME_DOUBTFUL = "time_doubtful"  # valid, but read late, so the time of measurement is unknown
 
@@ -166,7 +166,7 @@ class EventKind(StrEnum):
     EMERGENCY_CLEARED = "emergency_cleared"
     ALARM = "alarm"
     WARNING = "warning"
-    PRESET_JUMP = "preset_jump"  # an encoder's position jumped by more than it can move
+    PRESET_JUMP = "preset_jump"  # an encoder's position jumped by more than it can move, or it was exchanged
     CONFIGURED = "configured"
     LOCK_ACQUIRED = "lock_acquired"
     LOCK_LOST = "lock_lost"

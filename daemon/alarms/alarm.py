@@ -10,8 +10,8 @@ from daemon.host.safe_output import shown
 from daemon.monitoring.notice import Severity
 from drivers.clock import Stamp
 
-# Subject and text of a fault, and its severity where that differs from the rule's usual one.
-Finding = tuple[str, str] | tuple[str, str, Severity]
+# Subject and text of a fault, and its severity and remedy where these differ from the rule's usual ones.
+Finding = tuple[str, str] | tuple[str, str, Severity] | tuple[str, str, Severity, str]
 
 TEXT_MAX = 300  # an instrument may send any text of any length, control characters included
 
@@ -47,7 +47,7 @@ class Rule:
     Attributes:
         kind: kind of its alarms.
         severity: usual severity of its alarms.
-        remedy: what to do; SUBJECT in it stands for the alarm's subject.
+        remedy: what usually to do; SUBJECT in it stands for the alarm's subject.
         after_s: how long a fault must last before an alarm is raised.
         hold_s: how long the fault must be absent before the alarm is cleared.
         needs_decoding: the evidence is that of fresh readings. While captures wait to be stored or decoded, the rule is
@@ -80,10 +80,12 @@ class Rule:
         """Yield an alarm for every fault in the evidence; none while the rule is paused."""
         if self.is_paused(evidence):
             return
-        for subject, text, *severity in self.find(evidence):
-            how = severity[0] if severity else self.severity
+        for finding in self.find(evidence):
+            subject, text = finding[:2]
+            severity = self.severity if len(finding) == 2 else finding[2]
+            remedy = finding[3] if len(finding) == 4 else self.remedy
             plain = _cut(shown(text).removeprefix(f"{subject}: "))  # shown after the subject
-            yield Alarm(self.kind, subject, how, plain, self.remedy.replace("SUBJECT", subject))
+            yield Alarm(self.kind, subject, severity, plain, remedy.replace("SUBJECT", subject))
 
 
 def _cut(text: str) -> str:

@@ -311,7 +311,7 @@ def daemon_state(status: Mapping[str, Any], version: str) -> Iterator[Finding]:
     late = "the computer does not keep up with decoding: `top` shows what is busy"
     if hindrance:
         late = "it is decoded once the store can be written"
-    yield from _channels(acquisition["channels"], late)
+    yield from channel_findings(acquisition["channels"], late)
     for station in acquisition["stations"]:
         yield _station(station, late)
     yield from _time_outs(acquisition)
@@ -346,28 +346,33 @@ def _link(link: Mapping[str, Any], *, is_storing: bool) -> Finding:
     return Finding(f"link {link['name']}", "good", f"{link['captures_per_s']:.0f} captures/s")
 
 
-def _channels(channels: list[Mapping[str, Any]], late: str) -> Iterator[Finding]:
+def channel_findings(channels: list[Mapping[str, Any]], late: str) -> Iterator[Finding]:
     """Check joints and signals; channels of one kind that fail for the same reason share a finding.
 
     Args:
         channels: their states.
         late: remedy for those whose readings wait to be decoded.
     """
-    groups: dict[tuple[str, str], list[str]] = {}
+    from daemon.acquisition.status.silence import START_NODES
+
+    groups: dict[tuple[str, str, str], list[str]] = {}
     for channel in channels:
         if channel["status"] != "ok":
             since = channel_status(channel)
             if channel["age_s"] is None and since != LATE:
                 since = "never heard"
-            groups.setdefault((channel["kind"], since), []).append(channel["name"])
+            groups.setdefault((channel["kind"], since, channel.get("silence", "")), []).append(channel["name"])
     if channels and not groups:
         yield Finding("channels", "good", f"all {len(channels)} joints and signals are read")
-    for (kind, since), names in groups.items():
+    for (kind, since, silence), names in groups.items():
         state: State = "fault" if kind == "joint" else "warning"
         remedy = "check power and cable; `rigcal status --frames` shows which identifiers are received"
         if since == LATE:
             remedy = late
-        yield Finding(f"{kind}s", state, f"{since}: {', '.join(names)}", remedy)
+        elif silence:
+            remedy = START_NODES
+        why = f"; {silence}" if silence else ""
+        yield Finding(f"{kind}s", state, f"{since}: {', '.join(names)}{why}", remedy)
 
 
 def _station(station: Mapping[str, Any], late: str) -> Finding:

@@ -131,7 +131,6 @@ class _PositionDecoder(PdoChannelDecoder):
         return False
 
     def node_restarted(self) -> None:
-        super().node_restarted()
         self._flags = dict.fromkeys(_FLAGS, 0)
 
     def _take_flags(self, stamp: Stamp, index: int, flags: int, name: str, records: list[Record]) -> None:

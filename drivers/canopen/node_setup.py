@@ -7,12 +7,12 @@ match is left unchanged. A node that refuses a setting stays pre-operational. Th
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Generator
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Generator
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 from drivers.can.frame import Frame
-from drivers.canopen.cia301 import NmtCommand, encode_nmt, sdo_request_id, sdo_response_id
+from drivers.canopen.cia301 import NmtCommand, NmtState, encode_nmt, heartbeat_id, sdo_request_id, sdo_response_id
 from drivers.canopen.cia404 import UNIT_TEXTS
 from drivers.canopen.cia406 import ALARMS, WARNINGS
 from drivers.canopen.pdo import (
@@ -29,6 +29,10 @@ from drivers.readings import DeviceEvent, EventKind
 
 ATTEMPTS = 3
 ANSWER_TIMEOUT_NS = 2 * NS_PER_S  # CiA 301 defines none; nodes answer within some 10 ms, except while storing settings
+
+DEVICE_TYPE = 0x1000  # the object that every set-up reads first
+NOT_USED = "its values are not used until a set-up succeeds"
+"""End of the text about a node that is not the one in the rig file; `SetupWatch.recall` needs it."""
 
 PROFILE_ENCODER = 0x0196  # CiA 406 in the low word of object 1000h
 PROFILE_ANALOGUE = 0x0194  # CiA 404
@@ -75,12 +79,25 @@ class NodeSetup:
         return f"{self.name} (node {self.node})"
 
 
-class _MismatchError(DeviceError):
+class MismatchError(DeviceError):
     """The node is not the expected one."""
 
 
+@dataclass
+class Findings:
+    """What the set-up of a node has found so far.
+
+    Attributes:
+        serial_number: object 1018h.4; None if it was not read, does not exist or is 0.
+        warnings: values that could not be verified.
+    """
+
+    serial_number: int | None = None
+    warnings: list[str] = field(default_factory=list)
+
+
 _Step = Transfer | NmtCommand
-_Script = Generator[_Step, bytes, str]
+Script = Generator[_Step, bytes, str]
 
 
 class SetupRunner:
@@ -94,9 +111,9 @@ class SetupRunner:
     def __init__(self) -> None:
         self._waiting: deque[NodeSetup] = deque()
         self._setup: NodeSetup | None = None  # the one in progress
-        self._script: _Script
+        self._script: Script
         self._exchange: SdoExchange
-        self._warnings: list[str] = []
+        self._found = Findings()
         self._attempt = 0
         self._deadline_ns = 0
         self._frames: list[Frame] = []
@@ -118,6 +135,8 @@ class SetupRunner:
 
     def feed(self, frame: Frame, now: Stamp) -> None:
         """Process a received frame."""
+        if frame.is_plain and frame.data == bytes((NmtState.BOOT_UP,)):
+            self._take_boot_up(frame.arbitration_id, now)
         if self._setup is None or not frame.is_plain or frame.arbitration_id != sdo_response_id(self._setup.node):
             return
         exchange = self._exchange
@@ -136,8 +155,8 @@ class SetupRunner:
         if self._setup is None:
             if self._waiting:
                 self._setup = self._waiting.popleft()
-                self._warnings = []
-                self._script = _script(self._setup, self._warnings)
+                self._found = Findings()
+                self._script = setup_script(self._setup, self._found)
                 self._step(self._setup, None, now)
         elif now.monotonic_ns >= self._deadline_ns:
             if self._attempt < ATTEMPTS:
@@ -153,10 +172,7 @@ class SetupRunner:
 
         A node whose CONFIGURED event was not taken yet counts as cancelled: its start command may not have been sent.
         """
-        for number, event in enumerate(self._events):
-            if event.kind is EventKind.CONFIGURED:
-                text = f"{event.device}: set-up was interrupted and may be incomplete because {cause}; request it again"
-                self._events[number] = replace(event, kind=EventKind.ALARM, text=text)
+        self._withdraw(cause)
         given_up = [(setup, "was not started") for setup in self._waiting]
         if self._setup is not None:
             given_up.insert(0, (self._setup, "was interrupted and may be incomplete"))
@@ -182,37 +198,82 @@ class SetupRunner:
         self._deadline_ns = now.monotonic_ns + ANSWER_TIMEOUT_NS
         self._frames.append(Frame(sdo_request_id(setup.node), self._exchange.request))
 
+    def _take_boot_up(self, arbitration_id: int, now: Stamp) -> None:
+        """Fail the set-up of a node that boots, which discards its settings, unless nothing was read from it yet."""
+        for frame in self._frames:
+            if frame == encode_nmt(NmtCommand.START, arbitration_id - heartbeat_id(0)):
+                self._frames.remove(frame)
+                self._withdraw("the node has booted")
+                return
+        setup = self._setup
+        if setup is None or arbitration_id != heartbeat_id(setup.node) or self._exchange.transfer.index == DEVICE_TYPE:
+            return
+        text = "set-up was interrupted because the node has booted, which discards its settings; request it again"
+        self._step(setup, DeviceError(setup.where, text), now)
+
+    def _withdraw(self, cause: str) -> None:
+        """Report a node whose start command was not sent as one whose set-up was interrupted because of `cause`."""
+        for number, event in enumerate(self._events):
+            if event.kind is EventKind.CONFIGURED:
+                where, _, _ = event.text.partition(": ")
+                text = f"{where}: set-up was interrupted and may be incomplete because {cause}; request it again"
+                self._events[number] = replace(event, kind=EventKind.ALARM, text=text)
+
     def _step(self, setup: NodeSetup, outcome: bytes | DeviceError | None, now: Stamp) -> None:
         """Run the script until its next transfer or its end."""
         try:
-            if isinstance(outcome, DeviceError):
-                step = self._script.throw(outcome)
-            else:
-                step = next(self._script) if outcome is None else self._script.send(outcome)
-            while isinstance(step, NmtCommand):
-                self._frames.append(encode_nmt(step, setup.node))
-                step = self._script.send(b"")
+            transfer = next_transfer(
+                self._script, outcome, lambda command: self._frames.append(encode_nmt(command, setup.node))
+            )
         except StopIteration as stop:
             self._end(setup, EventKind.CONFIGURED, str(stop.value), now)
         except DeviceError as error:
-            self._end(setup, EventKind.ALARM, f"{error}; the node was not started", now)
+            text = f"{error}; the node was not started"
+            if isinstance(error, MismatchError):
+                text += f"; {NOT_USED}"
+            self._end(setup, EventKind.ALARM, text, now)
         else:
-            self._exchange = SdoExchange(setup.where, step)
+            self._exchange = SdoExchange(setup.where, transfer)
             self._attempt = 0
             self._request(setup, now)
 
     def _end(self, setup: NodeSetup, kind: EventKind, text: str, now: Stamp) -> None:
         """Report the end of a node's set-up, and start the next node."""
-        for warning in self._warnings:
+        for warning in self._found.warnings:
             self._events.append(DeviceEvent(setup.name, now, EventKind.WARNING, f"{setup.where}: {warning}"))
         self._events.append(DeviceEvent(setup.name, now, kind, text))
         self._setup = None
         self.advance(now)
 
 
-def _script(setup: NodeSetup, warnings: list[str]) -> _Script:
+def next_transfer(
+    script: Script, outcome: bytes | DeviceError | None, command: Callable[[NmtCommand], object]
+) -> Transfer:
+    """Resume a script with the outcome of its last transfer, and return its next transfer.
+
+    Args:
+        script: made by `setup_script`.
+        outcome: the data read or b"", or why the transfer has failed; None to begin.
+        command: called with each NMT command that is due before the next transfer.
+
+    Raises:
+        StopIteration: the script has ended; its value is the result.
+        DeviceError: the set-up has failed.
+    """
+    if isinstance(outcome, DeviceError):
+        step = script.throw(outcome)
+    else:
+        step = next(script) if outcome is None else script.send(outcome)
+    while isinstance(step, NmtCommand):
+        command(step)
+        step = script.send(b"")
+    return step
+
+
+def setup_script(setup: NodeSetup, found: Findings) -> Script:
     """Set up a node: yield transfers and NMT commands, receive the data read, and return a text with the result."""
-    identity = yield from _identify(setup)
+    warnings = found.warnings
+    identity = yield from _identify(setup, found)
     if setup.profile == PROFILE_ENCODER:
         measuring = yield from _check_position(setup, warnings)
     else:
@@ -225,10 +286,10 @@ def _script(setup: NodeSetup, warnings: list[str]) -> _Script:
     return f"{setup.where}: configured and started, sends {sampling}; {identity}; {measuring}"
 
 
-def _identify(setup: NodeSetup) -> _Script:
-    device_type = _unsigned((yield Upload(0x1000, 0)))
+def _identify(setup: NodeSetup, found: Findings) -> Script:
+    device_type = _unsigned((yield Upload(DEVICE_TYPE, 0)))
     if device_type & 0xFFFF != setup.profile:
-        raise _MismatchError(
+        raise MismatchError(
             setup.where,
             f"expected a device of profile {setup.profile:04X}h, found device type {device_type:08X}h (object 1000h)",
         )
@@ -237,10 +298,11 @@ def _identify(setup: NodeSetup) -> _Script:
         number = yield from _optional(0x1018, subindex)
         if number is not None:
             parts.append(f"{text} {number:X}h")
+    found.serial_number = number or None  # that of the last sub-index
     return ", ".join(parts)
 
 
-def _check_position(setup: NodeSetup, warnings: list[str]) -> _Script:
+def _check_position(setup: NodeSetup, warnings: list[str]) -> Script:
     units = yield from _optional(0x6001, 0)
     total = yield from _optional(0x6002, 0)
     status = yield from _optional(0x6500, 0)
@@ -265,7 +327,7 @@ def _check_position(setup: NodeSetup, warnings: list[str]) -> _Script:
     return f"{units} units per revolution, {total} in total"
 
 
-def _check_analogue(setup: NodeSetup, warnings: list[str]) -> _Script:
+def _check_analogue(setup: NodeSetup, warnings: list[str]) -> Script:
     unit = yield from _optional(0x6131, 1)
     digits = yield from _optional(0x6132, 1)
     _expect(setup, "decimal digits (6132h.1)", setup.decimal_digits, digits, warnings)
@@ -279,7 +341,7 @@ def _expect(setup: NodeSetup, what: str, expected: int | None, found: int | None
     if found is None:
         warnings.append(f"{what}: the node does not report it; expected {expected}, not verified")
     elif found != expected:
-        raise _MismatchError(
+        raise MismatchError(
             setup.where, f"{what}: expected {expected}, found {found}; correct the rig file or the node"
         )
 
@@ -290,7 +352,7 @@ def _check_pdo(setup: NodeSetup, warnings: list[str]) -> Generator[_Step, bytes,
     cob_id = _unsigned((yield Upload(communication, 1)))
     extended = COB_ID_EXTENDED if setup.pdo.is_extended else 0
     if cob_id & 0x3FFFFFFF != setup.pdo.arbitration_id | extended:
-        raise _MismatchError(
+        raise MismatchError(
             setup.where,
             f"TPDO{setup.pdo_number} ({communication:04X}h.1): expected COB-ID {setup.pdo.arbitration_id:X}h, "
             f"found {cob_id & 0x1FFFFFFF:X}h; correct the EDS or the node",
@@ -304,7 +366,7 @@ def _check_pdo(setup: NodeSetup, warnings: list[str]) -> Generator[_Step, bytes,
         found.append(_unsigned((yield Upload(mapping, len(found) + 1))))
     expected = list(setup.pdo.mapping.words)
     if found != expected:
-        raise _MismatchError(
+        raise MismatchError(
             setup.where,
             f"TPDO{setup.pdo_number} mapping ({mapping:04X}h): expected {_words(expected)}, found {_words(found)}; "
             "correct the rig file's object or EDS, or map the node",

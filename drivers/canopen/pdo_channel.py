@@ -45,7 +45,7 @@ class PdoChannelDecoder:
     """Base of the decoders of CANopen channels.
 
     Attributes:
-        is_void: the node has an emergency that makes its values invalid (set by the supervision of the node).
+        is_void: an emergency or a failed set-up makes the node's values invalid (set by the supervision of the node).
     """
 
     missed_frames: int | None = None  # PDOs have no counter
@@ -62,6 +62,11 @@ class PdoChannelDecoder:
         self._unit = channel.unit
         self._jumps: JumpWatch | None = None
 
+    @property
+    def is_joint(self) -> bool:
+        """True if the channel is checked for jumps, as those of joints are: its zero can be lost."""
+        return self._jumps is not None
+
     def object_read(self, stamp: Stamp, index: int, value: int) -> list[Record]:  # noqa: ARG002 - profiles use them
         """Return the records caused by an object of the node that was read over SDO.
 
@@ -77,8 +82,7 @@ class PdoChannelDecoder:
         return False
 
     def node_restarted(self) -> None:
-        """Discard the node's last known state, because the node has booted."""
-        self.is_void = False
+        """Discard what the channel knows of the node's state, because the node has booted."""
 
     def _too_short(self, stamp: Stamp, data: bytes, needed_bits: int) -> list[Record]:
         return too_short(self.name, self._unit, stamp, data, needed_bits, self._jumps)

@@ -7,8 +7,10 @@ from dataclasses import replace
 
 from drivers.canopen.cia301 import NmtState, decode_heartbeat, emcy_id, heartbeat_id, sdo_response_id
 from drivers.canopen.emcy import decode_emergency
+from drivers.canopen.node_setup import NodeSetup
 from drivers.canopen.pdo_channel import PdoChannelDecoder
 from drivers.canopen.sdo import UploadResponse, decode_response
+from drivers.canopen.setup_watch import SetupWatch
 from drivers.clock import NS_PER_S, Stamp
 from drivers.readings import DecodeFailure, DeviceEvent, EventKind, Record
 
@@ -33,15 +35,21 @@ class NodeSupervision:
     00xxh with an error register of zero, or a boot-up, makes the values valid again. A code 00xxh with bits left in the
     register means that one of several errors has cleared, but not which one (CiA 301, emergency state transitions).
 
+    A set-up that finds a different device than the rig file describes makes the values invalid until a set-up succeeds.
+    If the serial number is not that of the last set-up, the zeros of the node's joints count as lost.
+
     Args:
         node: node number.
         channels: decoders of the channels that the node feeds, at least one; events use the first one's name.
+        setup: expected identity and settings of the node; None if it is never set up.
     """
 
-    def __init__(self, node: int, channels: Sequence[PdoChannelDecoder]) -> None:
+    def __init__(self, node: int, channels: Sequence[PdoChannelDecoder], setup: NodeSetup | None = None) -> None:
         self.node = node
         self._channels = tuple(channels)
         self._name = channels[0].name
+        self._setups = None if setup is None else SetupWatch(setup)
+        self._has_failed = False  # by an emergency
         self._state: NmtState | None = None
         self._heartbeat: Stamp | None = None
         self._is_lost = False
@@ -66,21 +74,29 @@ class NodeSupervision:
             The event under the current name of the node, or of each channel whose alarms or warnings it restores; empty
             if it is about a different node or changes nothing.
         """
-        if not event.text.startswith((f"node {self.node}:", f"node {self.node} ")):
+        is_of_setup = event.kind is EventKind.CONFIGURED or (event.kind is EventKind.ALARM and event.code is None)
+        about = (f"node {self.node}:", f"node {self.node} ")
+        if is_of_setup and self._setups is not None:
+            if not event.text.startswith((*about, f"{event.device} (node {self.node}):")):
+                return []
+            self._setups.recall(event)
+            self._mark()
+            return [replace(event, device=self._setups.name)]
+        if is_of_setup or not event.text.startswith(about):
             return []
         if event.kind in (EventKind.ALARM, EventKind.WARNING):
             return [replace(event, device=channel.name) for channel in self._channels if channel.recall(event)]
         if event.kind is EventKind.BOOT_UP:
-            for channel in self._channels:
-                channel.node_restarted()
+            self._restarted()
         elif event.kind is EventKind.EMERGENCY_CLEARED:
-            self._void(is_void=False)
+            self._has_failed = False
         elif event.kind is EventKind.EMERGENCY and event.text.endswith(VOIDS):
-            self._void(is_void=True)
+            self._has_failed = True
         elif event.kind in (EventKind.HEARTBEAT_LOST, EventKind.HEARTBEAT_RESTORED):
             if not self._timeout_ns:
                 return []
             self._is_lost = event.kind is EventKind.HEARTBEAT_LOST
+        self._mark()
         return [replace(event, device=self._name)]
 
     def tick(self, now: Stamp) -> list[Record]:
@@ -107,8 +123,7 @@ class NodeSupervision:
         if state is NmtState.BOOT_UP:
             text = f"node {self.node} has booted; it sends no values until it is started"
             records.append(DeviceEvent(self._name, stamp, EventKind.BOOT_UP, text))
-            for channel in self._channels:
-                channel.node_restarted()
+            self._restarted()
         elif state is not self._state:
             before = "" if self._state is None else f", was {self._state.words}"
             text = f"node {self.node} is {state.words}{before}"
@@ -122,18 +137,30 @@ class NodeSupervision:
         except ValueError as error:
             return [DecodeFailure(self._name, stamp, f"node {self.node}: {error}", data)]
         if emergency.is_reset and not emergency.register:
-            self._void(is_void=False)
+            self._has_failed = False
+            self._mark()
             text = f"node {self.node}: all errors have cleared ({emergency.words})"
             return [DeviceEvent(self._name, stamp, EventKind.EMERGENCY_CLEARED, text, emergency.code)]
-        is_void = emergency.code & 0xF000 == _CLASS_HARDWARE or bool(emergency.register & _REGISTER_DEVICE_PROFILE)
+        is_failure = emergency.code & 0xF000 == _CLASS_HARDWARE or bool(emergency.register & _REGISTER_DEVICE_PROFILE)
         # A later emergency does not make values valid again that an earlier one made invalid
-        is_void |= any(channel.is_void for channel in self._channels)
-        self._void(is_void=is_void)
+        self._has_failed |= is_failure
+        self._mark()
         what = f"one error has cleared, others remain: {emergency.words}" if emergency.is_reset else emergency.words
-        text = f"node {self.node}: {what}{f'; {VOIDS}' if is_void else ''}"
+        text = f"node {self.node}: {what}{f'; {VOIDS}' if self._has_failed else ''}"
         return [DeviceEvent(self._name, stamp, EventKind.EMERGENCY, text, emergency.code or None)]
 
-    def _void(self, *, is_void: bool) -> None:
+    def _restarted(self) -> None:
+        """Discard the state that a node loses when it boots; it stays the device that its set-up has found."""
+        self._has_failed = False
+        if self._setups is not None:
+            self._setups.booted()
+        for channel in self._channels:
+            channel.node_restarted()
+        self._mark()
+
+    def _mark(self) -> None:
+        """Tell the channels whether the node's values are valid."""
+        is_void = self._has_failed or (self._setups is not None and self._setups.is_mismatched)
         for channel in self._channels:
             channel.is_void = is_void
 
@@ -143,7 +170,20 @@ class NodeSupervision:
             response = decode_response(data)
         except ValueError:
             return []  # block transfer or similar; no reading depends on it
+        exchanged = None if self._setups is None else self._setups.feed(data)
+        self._mark()
+        if exchanged is not None:
+            return self._exchanged(stamp, exchanged)
         if not isinstance(response, UploadResponse) or response.data is None:
             return []
         value = int.from_bytes(response.data, "little")
         return [r for channel in self._channels for r in channel.object_read(stamp, response.index, value)]
+
+    def _exchanged(self, stamp: Stamp, serial_numbers: str) -> list[Record]:
+        """Return the events that report that the zeros of the node's joints belong to a different device."""
+        text = (
+            f"node {self.node}: a different device answers than at its last set-up ({serial_numbers}), so the joint's "
+            "zero is no longer valid: check the zero, then confirm it by `rigcal model zeros-checked`"
+        )
+        joints = [channel.name for channel in self._channels if channel.is_joint]
+        return [DeviceEvent(name, stamp, EventKind.PRESET_JUMP, text) for name in joints]

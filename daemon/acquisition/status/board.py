@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections import Counter, deque
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 from daemon.acquisition.link_intake import LinkIntake
@@ -21,6 +21,7 @@ from daemon.acquisition.status.present import (
     station_sentence,
 )
 from daemon.acquisition.status.recent_counts import RecentCounts
+from daemon.acquisition.status.silence import why_silent
 from daemon.acquisition.status.snapshot import (
     AcquisitionStatus,
     ChannelStatus,
@@ -209,17 +210,20 @@ class StatusBoard:
             links = [self._link(intake, heard.get(intake.name), defects.get(intake.name), now) for intake in intakes]
             by_name = {link.name: link for link in links}
             decoded_age_s = None if self._decoded_until is None else _age_s(self._decoded_until, now)
+            frames = _frames(summaries)
+            events = sorted(
+                (_event(number, event, now) for number, event in self._events.values()), key=lambda e: e.number
+            )
+            channels = [self._channel(name, by_name, now) for name in self._known(self._channels, self._readings)]
             return AcquisitionStatus(
                 links=links,
-                frames=_frames(summaries),
-                channels=[self._channel(name, by_name, now) for name in self._known(self._channels, self._readings)],
+                frames=frames,
+                channels=[self._explained(channel, by_name, frames, events) for channel in channels],
                 stations=[self._station(name, by_name, now) for name in self._known(self._stations, self._fixes)],
                 decode_failures=self._failures.totals(),
                 decoding=self._failures.status(),
                 gaps=sorted((_gap(gap, now) for gap in self._gaps.values()), key=lambda gap: -gap.age_s),
-                last_events=sorted(
-                    (_event(number, event, now) for number, event in self._events.values()), key=lambda e: e.number
-                ),
+                last_events=events,
                 gap_counts=[self._gap_count(*key) for key in self._gap_counts],
                 event_counts=[EventCount(device, kind, count) for (device, kind), count in self._event_counts.items()],
                 writer_lag_s=last_lag / NS_PER_S,
@@ -264,6 +268,22 @@ class StatusBoard:
             kind=expected.kind,
             is_silent=self._is_silent(last, age_s, expected.timeout_s, links.get(expected.link), now),
         )
+
+    def _explained(
+        self,
+        channel: ChannelStatus,
+        links: Mapping[str, LinkStatus],
+        frames: Sequence[FrameStatus],
+        events: Sequence[EventStatus],
+    ) -> ChannelStatus:
+        """Return the channel's state with the reason of its silence, if its node shows one."""
+        expected = self._channels.get(channel.name)
+        if not channel.is_silent or expected is None or expected.node is None:
+            return channel
+        place = expected.link, expected.node
+        names = [other.name for other in self._channels.values() if (other.link, other.node) == place]
+        since_s = _open(links.get(expected.link))[1] if channel.age_s is None else channel.age_s
+        return replace(channel, silence=why_silent(channel, expected.node, names, since_s, frames, events))
 
     def _station(self, name: str, links: Mapping[str, LinkStatus], now: Stamp) -> StationStatus:
         fix, good = self._fixes.get(name), self._good_fixes.get(name)

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from calibration.rig.description import Rig
+from daemon.acquisition.channel_files import CanopenChannel
 from daemon.config.config import Config
 from daemon.host.safe_output import duration
 
@@ -29,6 +30,7 @@ class ExpectedChannel:
         link: link from which it is read.
         kind: joint of the boom, or signal.
         timeout_s: without a reading for longer than this the channel is silent.
+        node: number of the CANopen node that sends it; None for other devices.
     """
 
     name: str
@@ -36,6 +38,7 @@ class ExpectedChannel:
     link: str
     kind: Kind
     timeout_s: float
+    node: int | None = None
 
 
 @dataclass(frozen=True)
@@ -73,7 +76,14 @@ def expected_of(config: Config, rig: Rig) -> Expected:
     joints = rig.joint_names
     return Expected(
         tuple(
-            ExpectedChannel(c.name, c.unit, c.link, "joint" if c.name in joints else "signal", c.timeout_s)
+            ExpectedChannel(
+                c.name,
+                c.unit,
+                c.link,
+                "joint" if c.name in joints else "signal",
+                c.timeout_s,
+                c.node if isinstance(c, CanopenChannel) else None,
+            )
             for c in rig.channels
         ),
         tuple(ExpectedStation(station.name, station.silence_timeout_s) for station in config.station),

@@ -82,6 +82,7 @@ class ChannelStatus:
         link: link from which it is read; "" if it is not a channel of the rig.
         kind: joint or signal.
         is_silent: its timeout has passed without a reading, and no reading waits to be stored or decoded.
+        silence: why a silent channel's node sends no values although it lives, a clause; "" if that is not known.
     """
 
     name: str
@@ -93,6 +94,7 @@ class ChannelStatus:
     link: str = ""
     kind: Kind = "signal"
     is_silent: bool = False
+    silence: str = ""
 
 
 @dataclass(frozen=True)

@@ -75,11 +75,12 @@ def device_alarm(evidence: Evidence) -> Iterator[Finding]:
     """A device reports an alarm (object 6503h), or its set-up has failed.
 
     Cleared when the device reports that the alarm is gone, or boots. After a failed set-up, cleared when a set-up
-    succeeds.
+    succeeds, also if the daemon or the computer is restarted before. If the set-up has shown that the device is not the
+    one in the rig file, its readings are not used until then.
     """
-    since_set_up = evidence.active_events(EventKind.ALARM, EventKind.CONFIGURED)
-    active = evidence.active_events(EventKind.ALARM, EventKind.BOOT_UP)
-    yield from _by_device(evidence, [e for e in active if e.code is not None or e in since_set_up])
+    of_devices = [e for e in evidence.active_events(EventKind.ALARM, EventKind.BOOT_UP) if e.code is not None]
+    of_set_ups = [e for e in evidence.active_events(EventKind.ALARM, EventKind.CONFIGURED) if e.code is None]
+    yield from _by_device(evidence, sorted([*of_devices, *of_set_ups], key=lambda event: event.number))
 
 
 @rule("warning", "Follow the text of the warning. The device's values are still used.")

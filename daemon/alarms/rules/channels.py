@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from daemon.acquisition.status.present import is_present
+from daemon.acquisition.status.silence import START_NODES
 from daemon.acquisition.status.snapshot import ChannelStatus
 from daemon.alarms.alarm import Finding, rule
 from daemon.alarms.evidence import Evidence
+from daemon.monitoring.notice import Severity
 from drivers.readings import EventKind, Status
 
 START_S = 5.0  # time that devices need to start after their link was opened
@@ -16,7 +18,7 @@ AT_ONCE_S = 0.5  # devices last received within this time of each other fell sil
 _WHY = {
     Status.NOT_AVAILABLE: "the device reports that it has no value",
     Status.OUT_OF_RANGE: "the value is outside the device's measuring range",
-    Status.DEVICE_ALARM: "the device reports an alarm that makes its value invalid",
+    Status.DEVICE_ALARM: "an alarm of the device makes its value invalid, or its set-up found a wrong device",
     Status.MALFORMED: "the value cannot be decoded",
     Status.TIME_DOUBTFUL: "this computer reads too late to know when the value was measured; check what keeps it busy",
 }
@@ -50,9 +52,10 @@ def link_silent(evidence: Evidence) -> Iterator[Finding]:
 def joint_silent(evidence: Evidence) -> Iterator[Finding]:
     """No reading of a joint has arrived for 1 s longer than its timeout, and its link has been open for 5 s.
 
-    Cleared when readings have arrived again for 3 s.
+    If its node has booted since the last reading, or still sends its heartbeat, the alarm says so and asks to start the
+    node instead. Cleared when readings have arrived again for 3 s.
     """
-    yield from _silent(evidence, "joint")
+    yield from _silent(evidence, "joint", "critical")
 
 
 @rule(
@@ -67,7 +70,7 @@ def signal_silent(evidence: Evidence) -> Iterator[Finding]:
 
     Raised and cleared as for joints.
     """
-    yield from _silent(evidence, "signal")
+    yield from _silent(evidence, "signal", "warning")
 
 
 @rule(
@@ -78,7 +81,7 @@ def joint_not_usable(evidence: Evidence) -> Iterator[Finding]:
 
     The device has no value, reports an alarm or is out of its range; or its value cannot be decoded, or was read too
     late for its time to be known. Raised after 1.5 s, so that one bad sample raises no alarm; cleared after 3 s of good
-    samples. Not raised where the device's own alarm or emergency is active, which explains the invalid values.
+    samples. Not raised where the device's own alarm, an emergency or a failed set-up explains the invalid values.
     """
     yield from _not_usable(evidence, "joint")
 
@@ -124,7 +127,7 @@ def _has_started(evidence: Evidence, channel: ChannelStatus) -> bool:
     return link is None or link.since_s - (evidence.acquisition.decoded_age_s or 0.0) >= START_S
 
 
-def _silent(evidence: Evidence, kind: str) -> Iterator[Finding]:
+def _silent(evidence: Evidence, kind: str, severity: Severity) -> Iterator[Finding]:
     for link, channels in _by_link(evidence).items():
         if _is_quiet(evidence, link, channels):
             continue
@@ -132,11 +135,15 @@ def _silent(evidence: Evidence, kind: str) -> Iterator[Finding]:
             if channel.kind == kind and channel.is_silent and _has_started(evidence, channel):
                 is_new = channel.last_status is None
                 text = "not received since the start" if is_new else f"no longer received (last: {channel.last_status})"
-                yield channel.name, f"{channel.name} is {text}"
+                if channel.silence:
+                    yield channel.name, f"{channel.name} is {text}: {channel.silence}", severity, START_NODES
+                else:
+                    yield channel.name, f"{channel.name} is {text}"
 
 
 def _not_usable(evidence: Evidence, kind: str) -> Iterator[Finding]:
     told = {event.device for event in evidence.active_events(EventKind.ALARM, EventKind.BOOT_UP) if event.code}
+    told |= {e.device for e in evidence.active_events(EventKind.ALARM, EventKind.CONFIGURED) if e.code is None}
     told |= {
         e.device for e in evidence.active_events(EventKind.EMERGENCY, EventKind.EMERGENCY_CLEARED, EventKind.BOOT_UP)
     }

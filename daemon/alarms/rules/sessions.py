@@ -152,13 +152,16 @@ def model_not_loaded(evidence: Evidence) -> Iterator[Finding]:
     hold_s=10.0,
 )
 def zero_lost(evidence: Evidence) -> Iterator[Finding]:
-    """The encoder of a joint has jumped, and nobody has checked its zero.
+    """The encoder of a joint has jumped or was exchanged, and nobody has checked its zero.
 
-    It has jumped since the live model was trained, since the newest session was started, or in the open session.
+    This happened since the live model was trained, since the newest session was started, or in the open session.
     Aborted and rejected sessions do not count. The model then gives no tip, no job uses sessions from before the jump,
     and the open session takes no more fixes. Cleared 10 s after none of these conditions holds.
     """
     model = () if evidence.model is None else evidence.model.jumped
     session = () if evidence.session is None else evidence.session.jumped
     for joint in dict.fromkeys((*model, *session, *evidence.zeros_lost)):
-        yield joint, f"{joint} has jumped by more than it can move; its zero is no longer valid"
+        yield (
+            joint,
+            f"{joint} has jumped by more than it can move, or its encoder was exchanged; its zero is no longer valid",
+        )

@@ -99,8 +99,16 @@ def _write(
         files.append(path)
         if doubts.runs:
             doubtful[link["name"]] = DoubtfulCaptures(captures=doubts.captures, runs=tuple(doubts.runs))
+    booted_ns = max(steady.of(replace(since, monotonic_ns=0)).utc_ns, 0)
     states = [
-        DeviceState(device=e.device, kind=e.kind, text=e.text, code=e.code, utc_ns=steady.of(e.stamp).utc_ns)
+        DeviceState(
+            device=e.device,
+            kind=e.kind,
+            text=e.text,
+            code=e.code,
+            # Set-ups of earlier boots come first
+            utc_ns=steady.of(e.stamp).utc_ns if e.stamp.boot_id == since.boot_id else booted_ns,
+        )
         for e in device_states(reader, since)
     ]
     words = [(row["turning"], steady.of(reader.stamp(row)).utc_ns) for row in prism_confirmations(reader, session_id)]

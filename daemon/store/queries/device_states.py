@@ -1,4 +1,4 @@
-"""The last reports of CANopen devices on their own state: emergencies, alarms, boot-ups, heartbeats."""
+"""The last reports on the states of CANopen devices: emergencies, alarms, boot-ups, heartbeats, set-ups."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from typing import Any
 
 from daemon.store.connection import Connection
 from daemon.store.reader import Reader
+from drivers.canopen.node_setup import NOT_USED
 from drivers.canopen.supervision import VOIDS
 from drivers.clock import Stamp
 from drivers.readings import DeviceEvent, EventKind
@@ -28,32 +29,49 @@ _DEVICES = """WITH RECURSIVE named(device) AS (
 _LAST = """SELECT id, utc_ns, monotonic_ns, boot_id, device, kind, text, code FROM device_events
     WHERE device = ? AND kind = ? AND boot_id = ? AND monotonic_ns < ? AND {}
     ORDER BY monotonic_ns DESC, id DESC LIMIT 1"""
+# A set-up outlasts boots of the computer, whose numbers increase.
+_LAST_OF_SET_UPS = """SELECT id, utc_ns, monotonic_ns, boot_id, device, kind, text, code FROM device_events
+    WHERE device = ? AND kind = ? AND (boot_id, monotonic_ns) < (?, ?) AND (boot_id, monotonic_ns) >= (?, ?) AND {}
+    ORDER BY boot_id DESC, monotonic_ns DESC, id DESC LIMIT 1"""
+_NEXT_BOOT = 2**63 - 1  # number of a boot that has no row yet
 
 
 def device_states(source: Connection | Reader, before: Stamp) -> list[DeviceEvent]:
     """Return the last event of each device and kind before an instant, in its boot, oldest first.
 
-    For emergencies both the last one and the last one that voids values are returned. Events that were not sent by the
-    devices themselves, such as that of a failed set-up, have no code and are left out.
+    For emergencies both the last one and the last one that voids values are returned. Of set-ups, the last one that
+    succeeded and the last one that has failed since are returned, also from earlier boots, and the last one since that
+    found a wrong device. Other alarms and warnings without a code were not sent by the devices, and are left out.
 
     Args:
         source: the store.
         before: the instant.
     """
     boots = list(source.rows("SELECT id FROM boots WHERE kernel_boot_id = ?", [before.boot_id]))
-    if not boots:
-        return []
+    boot = boots[0]["id"] if boots else _NEXT_BOOT
     found: dict[int, dict[str, Any]] = {}
     for device in [row["device"] for row in source.rows(_DEVICES)]:
         for kind in STATES:
-            about = (device, kind.value, boots[0]["id"], before.monotonic_ns)
+            about = (device, kind.value, boot, before.monotonic_ns)
             sent = "code IS NOT NULL" if kind in (EventKind.ALARM, EventKind.WARNING) else "TRUE"
             rows = list(source.rows(_LAST.format(sent), about))
             if kind is EventKind.EMERGENCY:
                 rows += source.rows(_LAST.format("text LIKE '%' || ?"), (*about, VOIDS))
             found |= {row["id"]: row for row in rows}
+        found |= {row["id"]: row for row in _set_ups(source, device, (boot, before.monotonic_ns))}
     return [
         DeviceEvent(row["device"], source.stamp(row), EventKind(row["kind"]), row["text"], row["code"])
         # Frames that were read together share a stamp.
-        for row in sorted(found.values(), key=lambda row: (row["monotonic_ns"], row["id"]))
+        for row in sorted(found.values(), key=lambda row: (row["boot_id"], row["monotonic_ns"], row["id"]))
     ]
+
+
+def _set_ups(source: Connection | Reader, device: str, before: tuple[int, int]) -> list[dict[str, Any]]:
+    """Return the rows of a node's last set-ups before an instant, given as its boot and its monotonic time."""
+    of_node, failed = "text LIKE '% (node %'", "code IS NULL"  # a station is configured, too
+    rows = list(source.rows(_LAST_OF_SET_UPS.format(of_node), (device, EventKind.CONFIGURED.value, *before, 0, 0)))
+    since = (rows[0]["boot_id"], rows[0]["monotonic_ns"]) if rows else (0, 0)
+    about = (device, EventKind.ALARM.value, *before, *since)
+    rows += source.rows(_LAST_OF_SET_UPS.format(failed), about)
+    rows += source.rows(_LAST_OF_SET_UPS.format(f"{failed} AND text LIKE '%' || ?"), (*about, NOT_USED))
+    return rows

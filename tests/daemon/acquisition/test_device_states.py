@@ -11,10 +11,13 @@ import pytest
 from daemon.acquisition.acquisition import Acquisition
 from daemon.acquisition.redecoding import redecode
 from daemon.acquisition.status.present import Expected, ExpectedChannel
+from daemon.alarms.evidence import Evidence
+from daemon.alarms.library import library
 from daemon.store import Store
 from daemon.store.queries.device_states import device_states
 from drivers.can_decoder import CanDecoder
 from drivers.canopen.cia406 import EncoderChannel, EncoderDecoder
+from drivers.canopen.node_setup import NOT_USED, PROFILE_ENCODER, NodeSetup
 from drivers.canopen.pdo import TransmitPdo
 from drivers.canopen.supervision import VOIDS
 from drivers.clock import SystemClock
@@ -32,10 +35,35 @@ HARDWARE, OVERRUN, TAKEN_BACK = (
 )
 
 
+# The answers of an encoder of 13 bits to a set-up that expects 16
+WRONG_DEVICE = (
+    "5A0 43 00 10 00 96 01 02 00",
+    *(f"5A0 80 18 10 0{n} 00 00 02 06" for n in (1, 2, 3, 4)),
+    *(f"5A0 43 0{n} 60 00 00 20 00 00" for n in (1, 2)),
+    "5A0 43 00 65 00 04 00 00 00",
+    *(f"5A0 80 0{n} 65 00 00 00 02 06" for n in (1, 2, 3, 5)),
+)
+REFUSED = DeviceEvent(
+    "theta1", at(1), EventKind.ALARM, f"theta1 (node 32): units: expected 65536, found 8192; {NOT_USED}"
+)
+UNANSWERED = DeviceEvent("theta1", at(2), EventKind.ALARM, "theta1 (node 32): reading 1000h.0: no answer")
+CONFIGURED = DeviceEvent("theta1", at(3), EventKind.CONFIGURED, "theta1 (node 32): configured and started")
+
+
 def can_link(name: str, channel: str) -> CanDecoder:
-    return CanDecoder(
-        name, [EncoderDecoder(EncoderChannel(name=channel, node=32, pdo=TransmitPdo.from_eds(EDS, 32, 1)))]
+    pdo = TransmitPdo.from_eds(EDS, 32, 1)
+    setup = NodeSetup(
+        node=32,
+        name=channel,
+        profile=PROFILE_ENCODER,
+        pdo=pdo,
+        mode="sync",
+        period_ms=20,
+        heartbeat_ms=1000,
+        units_per_revolution=65536,
+        total_units=65536,
     )
+    return CanDecoder(name, [EncoderDecoder(EncoderChannel(name=channel, node=32, pdo=pdo))], [setup])
 
 
 def boom() -> CanDecoder:
@@ -130,6 +158,57 @@ def test_of_a_storm_the_last_event_and_the_last_that_voids_are_told(store: Store
     store.insert_records([void, *storm, later])
     assert device_states(store, at(50)) == [void, storm[-1]]
     assert device_states(store, at(61)) == [void, storm[-1], later]
+
+
+@pytest.mark.parametrize(
+    ("told", "status"),
+    [
+        ([REFUSED], "device_alarm"),
+        ([REFUSED, UNANSWERED], "device_alarm"),
+        ([REFUSED, CONFIGURED], "ok"),
+        ([UNANSWERED], "ok"),
+    ],
+    ids=["wrong", "wrong, then no answer", "wrong, then set up", "no answer"],
+)
+@pytest.mark.parametrize("boot_id", ["boot", "another"])
+def test_a_device_that_its_set_up_found_wrong_is_wrong_after_a_restart_of_daemon_or_computer(
+    store: Store, acquire: Make, told: list[DeviceEvent], status: str, boot_id: str
+) -> None:
+    acquire([], DECODERS).run_inline(told)
+    after = capture(PDO, 50)
+    acquire([], DECODERS).run_inline([replace(after, stamp=replace(after.stamp, boot_id=boot_id))])
+    assert statuses(store) == [status]
+
+
+def test_a_recording_of_a_set_up_that_found_a_wrong_device_gives_no_values(store: Store, acquire: Make) -> None:
+    heard = [capture(PDO), *(capture(text, 1) for text in WRONG_DEVICE), capture(PDO, 2)]
+    acquire([], DECODERS).run_inline(heard)
+    assert statuses(store) == ["ok", "device_alarm"]
+
+
+@pytest.mark.parametrize("booted", [False, True])
+def test_a_set_up_that_failed_is_an_alarm_after_a_restart_until_one_succeeds(
+    store: Store, acquire: Make, booted: bool
+) -> None:
+    clock = SystemClock()
+    failed = replace(UNANSWERED, stamp=clock.now())
+    store.insert_records([failed])
+    if booted:
+        store.insert_records([DeviceEvent("theta1", clock.now(), EventKind.BOOT_UP, "node 32 has booted")])
+    expected = Expected((ExpectedChannel("theta1", "deg", "boom", "joint", 1.0),))
+    acquiring = acquire([ListLink("boom", [])], DECODERS, clock=clock, expected=expected)
+    acquiring.start()
+
+    def alarms() -> list[str]:
+        evidence = Evidence(clock.now(), 100.0, acquisition=acquiring.status())
+        return [alarm.text for rule in library() for alarm in rule(evidence) if alarm.kind == "device_alarm"]
+
+    assert alarms() == [failed.text]
+    store.insert_records([replace(CONFIGURED, stamp=clock.now())])
+    again = acquire([ListLink("boom", [])], DECODERS, clock=clock, expected=expected)
+    again.start()
+    acquiring = again
+    assert alarms() == []
 
 
 def test_damage_to_what_devices_have_told_keeps_no_reading_from_being_decoded(path: Path) -> None:

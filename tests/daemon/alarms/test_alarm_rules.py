@@ -193,6 +193,11 @@ CASES: dict[str, list[tuple[Evidence, list[str], Evidence]]] = {
             ["theta1"],
             known(event(E.ALARM, "theta1"), event(E.CONFIGURED, "theta1", 2)),
         ),
+        (  # a device that its set-up found wrong boots as the same device
+            known(event(E.ALARM, "theta1"), event(E.BOOT_UP, "theta1", 2)),
+            ["theta1"],
+            known(event(E.ALARM, "theta1"), event(E.BOOT_UP, "theta1", 2), event(E.CONFIGURED, "theta1", 3)),
+        ),
         (
             known(event(E.ALARM, "theta1", code=1), event(E.CONFIGURED, "theta1", 2)),
             ["theta1"],

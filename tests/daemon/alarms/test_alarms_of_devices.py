@@ -3,11 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import asdict, replace
 
+import pytest
+
+from daemon.acquisition.link_intake import LinkIntake
 from daemon.acquisition.status.board import StatusBoard
 from daemon.acquisition.status.present import Expected, ExpectedChannel
+from daemon.acquisition.status.snapshot import AcquisitionStatus
+from daemon.alarms.alarm import Alarm
 from daemon.alarms.evidence import Evidence
 from daemon.alarms.library import library
+from daemon.cli.diagnosis import channel_findings
 from drivers.can.raw_signal import BitField, SignalChannel, SignalDecoder
 from drivers.can_decoder import CanDecoder
 from drivers.canopen.cia406 import EncoderChannel, EncoderDecoder
@@ -15,7 +22,9 @@ from drivers.canopen.node_setup import PROFILE_ENCODER, NodeSetup, SetupRunner
 from drivers.canopen.pdo import TransmitPdo
 from drivers.clock import ManualClock
 from drivers.readings import CanCapture, DeviceEvent, EventKind, Record
+from tests.daemon.support.acquisition import ListLink
 from tests.daemon.support.store import at
+from tests.drivers.can_support import capture
 
 PDO = TransmitPdo.usual(5, 1, [0x60040020, 0x65030010])
 SETUP = NodeSetup(
@@ -38,7 +47,10 @@ class Joint:
         self.clock = ManualClock(at(0))
         self._decoder = CanDecoder("boom", [decoder])
         self._arbitration_id = decoder.arbitration_id
-        self._board = StatusBoard(self.clock, Expected((ExpectedChannel("theta1", "deg", "boom", "joint", 1.0),)))
+        theta1 = ExpectedChannel("theta1", "deg", "boom", "joint", 1.0, 5)
+        theta2 = ExpectedChannel("theta2", "deg", "boom", "joint", 1.0, 6)
+        self._board = StatusBoard(self.clock, Expected((theta1, theta2)))
+        self._intakes: list[LinkIntake] = []
 
     def record(self, records: Iterable[Record]) -> None:
         self._board.recorded([*records], self.clock.now())
@@ -46,9 +58,25 @@ class Joint:
     def hear(self, data: bytes) -> None:
         self.record(self._decoder.feed(CanCapture("boom", self.clock.now(), self._arbitration_id, data)))
 
+    def open_link(self) -> None:
+        self._intakes = [LinkIntake(ListLink("boom", []), self.clock, 10, self.clock.now())]
+        self.record([DeviceEvent("boom", self.clock.now(), EventKind.LINK_UP, "boom: the bus is open")])
+
+    def hear_frame(self, text: str) -> None:
+        """Receive a frame, and let 0.5 s pass after it."""
+        self.record(self._decoder.feed(replace(capture(text), stamp=self.clock.now())))
+        self.clock.advance(0.5)
+        self.record(self._decoder.tick(self.clock.now()))
+
+    def status(self) -> AcquisitionStatus:
+        return self._board.snapshot(self._intakes, [self._decoder.summary(self.clock.now())])
+
+    def found(self) -> list[Alarm]:
+        evidence = Evidence(self.clock.now(), 100.0, acquisition=self.status())
+        return [alarm for rule in library() for alarm in rule(evidence) if alarm.subject == "theta1"]
+
     def alarms(self) -> set[str]:
-        evidence = Evidence(self.clock.now(), 100.0, acquisition=self._board.snapshot([], []))
-        return {alarm.kind for rule in library() for alarm in rule(evidence) if alarm.subject == "theta1"}
+        return {alarm.kind for alarm in self.found()}
 
 
 def test_a_set_up_that_failed_and_was_repeated_hides_no_alarm_of_the_device() -> None:
@@ -75,6 +103,49 @@ def test_a_set_up_that_failed_and_was_repeated_hides_no_alarm_of_the_device() ->
     assert joint.alarms() == {"device_alarm"}
     hear(0)
     assert joint.alarms() == set()
+
+
+POSITION = "185 00 40 00 00 00 00"
+
+
+@pytest.mark.parametrize(
+    ("heard", "why"),
+    [
+        (["705 00", "706 05", "706 05"], "its node has booted, and sends no values until it is started"),
+        (["705 00", "705 7F", "705 7F"], "its node has booted, and sends no values until it is started"),
+        (["705 7F"] * 4, "its node lives but is pre-operational, and sends no values until it is started"),
+        (["705 05"] * 4, "its node lives, as its heartbeat shows, but sends no values: SYNC or its set-up is missing"),
+        (["706 05"] * 4, ""),
+        (["705 05", *["706 05"] * 12], ""),
+        (["705 00", "705 7F", *["706 05"] * 12], ""),
+    ],
+    ids=["booted", "booted, lives", "pre-operational", "no SYNC", "dead", "died", "booted and died"],
+)
+def test_a_silent_joint_whose_node_lives_asks_to_start_it_and_not_to_check_its_cable(
+    heard: list[str], why: str
+) -> None:
+    joint = Joint(EncoderDecoder(EncoderChannel(name="theta1", node=5, pdo=PDO)))
+    for frame in ["705 05", POSITION, POSITION, *heard, "706 05"]:
+        joint.hear_frame(frame)
+    (alarm,) = joint.found()
+    assert alarm.kind == "joint_silent"
+    assert alarm.severity == "critical"
+    assert alarm.text == f"theta1 is no longer received (last: ok){f': {why}' if why else ''}"
+    assert ("`rigcal devices configure`" in alarm.remedy) is bool(why)
+    assert ("cable" in alarm.remedy) is (not why)
+    status = asdict(joint.status())
+    (found, *_) = [one for one in channel_findings(status["channels"], "") if "theta1" in one.text]
+    assert why in found.text
+    assert (found.remedy == alarm.remedy) is bool(why)
+
+
+def test_a_joint_that_was_never_received_is_told_by_the_heartbeat_of_its_node() -> None:
+    joint = Joint(EncoderDecoder(EncoderChannel(name="theta1", node=5, pdo=PDO)))
+    joint.open_link()
+    for frame in ["705 7F"] * 12:
+        joint.hear_frame(frame)
+    (alarm,) = joint.found()
+    assert alarm.text.startswith("theta1 is not received since the start: its node lives but is pre-operational")
 
 
 def test_frames_that_are_missing_by_their_message_counter_are_an_alarm_until_they_come_again() -> None:

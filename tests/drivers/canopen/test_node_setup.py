@@ -187,7 +187,7 @@ def test_a_node_that_does_not_fit_is_told_and_left_as_it_was(
     (event,) = converse(node, setup())
     assert event.kind is EventKind.ALARM
     assert text in event.text
-    assert event.text.endswith("; the node was not started")
+    assert event.text.endswith("; the node was not started; its values are not used until a set-up succeeds")
     assert node.log == []
 
 
@@ -332,6 +332,58 @@ def test_a_node_whose_start_command_is_not_sent_is_not_reported_as_configured() 
     assert (event.kind, event.device) == (EventKind.ALARM, "theta1")
     assert "set-up was interrupted and may be incomplete because the link was lost" in event.text
     assert "nmt 01" not in node.log
+
+
+BOOT_UP = Frame(0x720, b"\0")
+
+
+def converse_until(node: Node, conversation: SetupRunner, last: str) -> None:
+    """Run a conversation until the node has logged `last`; its answer to that is fed as well."""
+    conversation.add(setup())
+    while last not in node.log:
+        conversation.advance(START)
+        for answer in [node.answer(frame) for frame in conversation.take_frames()]:
+            if answer is not None:
+                conversation.feed(answer, START)
+
+
+@pytest.mark.parametrize("last", ["nmt 80", "1800.1=C00001A0", "1800.5=0", "1800.1=400001A0"])
+def test_a_node_that_boots_during_its_set_up_is_not_reported_as_configured(last: str) -> None:
+    node, conversation = Node(), SetupRunner()
+    converse_until(node, conversation, last)
+    conversation.feed(BOOT_UP, START)
+    (event,) = conversation.take_events()
+    assert (event.kind, event.device) == (EventKind.ALARM, "theta1")
+    assert event.text == (
+        "theta1 (node 32): set-up was interrupted because the node has booted, which discards its settings; "
+        "request it again; the node was not started"
+    )
+    assert not conversation.is_active
+
+
+def test_a_node_that_boots_before_its_start_command_is_sent_is_not_started() -> None:
+    node, conversation = Node(), SetupRunner()
+    converse_until(node, conversation, "1017.0=3E8")
+    conversation.feed(BOOT_UP, START)
+    (event,) = conversation.take_events()
+    assert event.kind is EventKind.ALARM
+    assert event.text.startswith("theta1 (node 32): set-up was interrupted and may be incomplete because the node has")
+    assert conversation.take_frames() == []
+
+
+def test_a_node_that_boots_before_anything_was_read_from_it_is_set_up() -> None:
+    node, conversation = Node(), SetupRunner()
+    conversation.add(setup())
+    conversation.advance(START)
+    conversation.feed(BOOT_UP, START)
+    conversation.feed(Frame(0x721, b"\0"), START)
+    assert conversation.is_active
+    assert conversation.take_events() == []
+    for answer in [node.answer(frame) for frame in conversation.take_frames()]:
+        assert answer is not None
+        conversation.feed(answer, START)
+    conversation.feed(Frame(0x721, b"\0"), START)
+    assert conversation.is_active, "another node's boot-up is of no interest"
 
 
 @given(st.lists(st.binary(min_size=8, max_size=8), max_size=40))

@@ -86,12 +86,14 @@ def _answer(data: bytes, at: int, asked: bytes) -> tuple[bytes, int]:  # noqa: P
 
 def _supervision() -> Run:
     source = load_rig("swdt82")
-    factories = decoder_factories(source.rig, ChannelFiles.read(source.rig, source.directory), "boom")
+    files = ChannelFiles.read(source.rig, source.directory)
+    factories = decoder_factories(source.rig, files, "boom")
+    (setup,) = [one for one in node_setups(source.rig, files, "boom") if one.node == 32]
 
     def run(data: bytes) -> None:
         made = (make() for make in factories)
         channels = [c for c in made if isinstance(c, PdoChannelDecoder) and c.node == 32]
-        node = NodeSupervision(32, channels)
+        node = NodeSupervision(32, channels, setup)
         handlers = list(node.handlers.values())
         for capture in frames(data):
             classify(capture.arbitration_id & 0x7FF)

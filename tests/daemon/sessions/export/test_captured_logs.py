@@ -13,7 +13,7 @@ from daemon.sessions.export.session_file import read_session_file
 from daemon.sessions.replay import merged
 from daemon.store.errors import StoreError
 from drivers.clock import NS_PER_S, Stamp
-from drivers.readings import CanCapture, SerialCapture
+from drivers.readings import CanCapture, DeviceEvent, EventKind, SerialCapture
 from tests.daemon.support.sessions import Rig
 
 CONFIG = """
@@ -107,3 +107,20 @@ def test_a_damaged_store_leaves_no_part_of_a_session_s_logs(tmp_path: Path) -> N
     with pytest.raises(StoreError, match=f"raw chunk {chunk}"):
         export_session(config, "s1", tmp_path / "out", "log", times_away)
     assert [*(tmp_path / "out").iterdir()] == []
+
+
+def test_the_set_up_of_an_earlier_boot_comes_before_the_session_s_logs(tmp_path: Path) -> None:
+    config = parse_config(CONFIG, tmp_path / "rigcal.toml")
+    rig = Rig(config.store_path)
+    ahead = Stamp(BEGIN.utc_ns + 3600 * NS_PER_S, 900 * NS_PER_S, "boot-0")  # a clock that was wrong
+    set_up = DeviceEvent("theta1", ahead, EventKind.CONFIGURED, "theta1 (node 32): configured and started")
+    rig.store.insert_records([set_up])
+    rig.store.close()
+    rig = with_a_session(config.store_path)
+    rig.store.mark_decoded(rig.store.append_captures([CanCapture("boom", at_second(61, 0), 0x1A0, b"1")]))
+    rig.clock.set(at_second(62, 0))
+    close(rig)
+    (session,) = [p for p in export_session(config, "s1", tmp_path / "out", "log", times_away) if p.suffix == ".json"]
+    states = read_session_file(session).device_states
+    assert [state.kind for state in states] == [EventKind.CONFIGURED]
+    assert states[0].utc_ns < BEGIN.utc_ns
