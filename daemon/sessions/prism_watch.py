@@ -22,7 +22,7 @@ from daemon.sessions.station_setups import Place
 from daemon.store.errors import StoreError
 from daemon.store.queries.observations import fixes_since_used
 from daemon.store.queries.sessions import SessionTable, prism_confirmations
-from daemon.store.queries.zeros import preset_jumps
+from daemon.store.queries.zeros import newest_jumps
 from daemon.store.store import Store
 from drivers.clock import Clock, Stamp, lies_within
 from drivers.readings import DeviceEvent, EventKind, Fix, LockState, Status
@@ -69,9 +69,10 @@ class PrismWatch:
         session.evidence = self._evidence(session)
 
     def _evidence(self, session: OpenSession) -> PrismEvidence:
-        jumps = [jump for jump in preset_jumps(self._store, None) if jump.device in self._rig.joint_names]
+        jumped = [jump.at for jump in newest_jumps(self._store) if jump.device in self._rig.joint_names]
+        since = max(jumped, key=self._store.order, default=None)
         groups: dict[str, list[tuple[str, Mapping[str, float], Place]]] = {}
-        for row in self._table.standstill_observations(session.setup_id, jumps[-1].at if jumps else None):
+        for row in self._table.standstill_observations(session.setup_id, since):
             place_mm = row["x_mm"], row["y_mm"], row["z_mm"]
             groups.setdefault(row["session_id"], []).append((row["prism"], json.loads(row["values_json"]), place_mm))
         earlier = [sightings_of(self._rig, rows) for rows in groups.values()]
