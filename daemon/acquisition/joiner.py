@@ -151,6 +151,10 @@ class ObservationJoiner:
                     done += self._release()
         return done
 
+    def measured(self, fix: Fix) -> Stamp:
+        """Return when a fix was measured: its stamp minus the link delay of its station."""
+        return fix.stamp.shifted(-self._delay_ns.get(fix.station, 0))
+
     def latest(self) -> MachineState | str:
         """Return the machine's state at the newest instant at which every joint is known, or why there is none."""
         last = min(self._joints.values(), key=lambda joint: joint.newest_ns)
@@ -186,7 +190,7 @@ class ObservationJoiner:
                 signal.add(at_ns, record.value)
         elif isinstance(record, Fix):
             if record.status is Status.OK:
-                self._pending.append((record, record.stamp.shifted(-self._delay_ns.get(record.station, 0))))
+                self._pending.append((record, self.measured(record)))
         elif record.kind is EventKind.PRESET_JUMP and record.device in self._joints:
             self._joints[record.device].jumped(at_ns)
 

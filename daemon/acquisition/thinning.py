@@ -5,7 +5,7 @@ from __future__ import annotations
 import sqlite3
 from collections.abc import Callable, Sequence
 
-from drivers.clock import NS_PER_S, Stamp
+from drivers.clock import NS_PER_S
 from drivers.readings import Fix, Reading, Record
 
 INTERVAL_NS = NS_PER_S
@@ -17,10 +17,10 @@ class Thinning:
     All events, gaps and failures are kept, and all records in a session.
 
     Args:
-        is_of_session: returns whether an instant lies in a session.
+        is_of_session: returns whether a reading or fix was measured in a session.
     """
 
-    def __init__(self, is_of_session: Callable[[Stamp], bool]) -> None:
+    def __init__(self, is_of_session: Callable[[Reading | Fix], bool]) -> None:
         self._is_of_session = is_of_session
         self._kept: dict[tuple[type[Record], str], Reading | Fix] = {}
 
@@ -45,7 +45,7 @@ class Thinning:
             or last.stamp.boot_id != record.stamp.boot_id
             or not 0 <= record.stamp.monotonic_ns - last.stamp.monotonic_ns < INTERVAL_NS
         )
-        if not is_new and not self._is_of_session(record.stamp):
+        if not is_new and not self._is_of_session(record):
             return False
         self._kept[key] = record
         return True

@@ -36,7 +36,7 @@ from daemon.store.queries.sessions import (
     session,
 )
 from daemon.store.queries.setups import SetupTable
-from daemon.store.queries.zeros import lost_zeros, preset_jumps
+from daemon.store.queries.zeros import Zeros, first_jumps
 from daemon.store.store import Store
 from drivers.clock import Clock, Stamp
 
@@ -146,11 +146,8 @@ class SessionLifecycle:
 
     def jumped(self, session: OpenSession) -> dict[str, Stamp]:
         """Return the devices whose encoders jumped during a session, each with the instant of its first jump."""
-        jumped: dict[str, Stamp] = {}
-        for jump in preset_jumps(self._store, session.since):
-            if session.lasted(jump.at):
-                jumped.setdefault(jump.device, jump.at)
-        return jumped
+        jumps = first_jumps(self._store, session.since)
+        return {jump.device: jump.at for jump in jumps if session.lasted(jump.at)}
 
     def start(self, started: Stamp, session_id: str, rig_text: str, **columns: object) -> None:
         """Add an open session.
@@ -199,10 +196,16 @@ class SessionLifecycle:
                 self._judge_readings(row)
 
     def judge_zeros(self) -> None:
-        """Decide again whether calibration may use the closed sessions, after an encoder has jumped."""
+        """Decide again whether calibration may use the closed sessions, after an encoder has jumped.
+
+        Only sessions whose lost zeros have changed are judged, as a faulty encoder may jump many times a second.
+        """
         with self._store.transaction():
+            zeros = Zeros(self._store, self._rig.name)
             for row in self.table.closed():
-                if not (row["excluded"] or "").startswith(OTHER_RIG_FILE):
+                first = (row["excluded"] or "").split("; ")[0]
+                told = first if first.startswith(ZERO_LOST) else None
+                if not first.startswith(OTHER_RIG_FILE) and told != self._why_zero_lost(row, zeros):
                     self._judge_readings(row)
 
     def _judge_readings(self, closed: Mapping[str, Any]) -> None:
@@ -229,7 +232,11 @@ class SessionLifecycle:
         """
         if why := misreading(self._rig, row["rig_text"], row["prism"]):
             return f"{OTHER_RIG_FILE}{why}"
-        lost = lost_zeros(self._store, self._rig.name, self.table.zeros_known(row))
+        return self._why_zero_lost(row, Zeros(self._store, self._rig.name))
+
+    def _why_zero_lost(self, row: Mapping[str, Any], zeros: Zeros) -> str | None:
+        """Return which joints' zeros are no longer known to be a session's, a clause; None if all are."""
+        lost = zeros.lost(self.table.zeros_known(row))
         joints = [name for name in self._rig.joint_names if name in lost]
         return f"{ZERO_LOST}{', '.join(joints)}" if joints else None
 

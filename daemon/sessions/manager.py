@@ -38,11 +38,12 @@ from daemon.sessions.prisms.guard import MotionLimit, Suspicion
 from daemon.sessions.shot_times import ShotTimes
 from daemon.sessions.station_setups import CONTROL_POINT_RADIUS_MM, StationSetups
 from daemon.sessions.without_job import why_no_job
+from daemon.store.errors import StoreError
 from daemon.store.queries.jobs import JobTable
 from daemon.store.queries.observations import ObservationTable, first_constants_mm
 from daemon.store.store import Store
 from drivers.clock import NS_PER_S, Clock, Stamp, lies_within
-from drivers.readings import DeviceEvent, EventKind, Fix, Record
+from drivers.readings import DeviceEvent, EventKind, Fix, Reading, Record
 from drivers.stations.survey import position_mm
 
 log = logging.getLogger(__name__)
@@ -100,7 +101,7 @@ class SessionManager:
         self.turn = CommandTurn()
         self._shot: Shot | None = None
         self.pending = PendingWrites(store)
-        self._prisms = PrismWatch(store, rig, clock, limits, self.pending.add_event)
+        self._prisms = PrismWatch(store, rig, clock, limits, self.pending.add_event, joiner.measured)
         self._observing = ObservationMaker(rig, store, self._observations, self.pending, self._prisms, run_id)
         self._shot_times = ShotTimes(store, clock, limits, aim, self._prisms.turned, self.pending.add)
         self._advice = SessionAdvice(rig, setups, self._table, self._prisms)
@@ -136,22 +137,31 @@ class SessionManager:
                 self.pending.add(partial(self._lifecycle.judge_again, session_id))
             self._late.clear()
 
-    def is_of_session(self, stamp: Stamp) -> bool:
-        """Return True if an instant lies in the open session, or in an ended one that may still get fixes."""
-        return any(session.lasted(stamp) for session in self._taking())
+    def is_of_session(self, record: Reading | Fix) -> bool:
+        """Return True if a record was measured in the open session, or in an ended one that may still get fixes."""
+        at = self._joiner.measured(record) if isinstance(record, Fix) else record.stamp
+        return any(session.lasted(at) for session in self._taking())
 
     def _judge_again(self, records: Sequence[Record]) -> None:
-        """Judge sessions again of which more has become known, while all fixes before these records are stored."""
-        for session in self._taking():
-            if not session.is_outdated:
+        """Judge sessions again of which more has become known, while all fixes before these records are stored.
+
+        A computer that lacks a descriptor or memory keeps the judgement so far; it is tried again at the next fix.
+        """
+        fixes = [record for record in records if isinstance(record, Fix)]
+        for session in [session for session in self._taking() if session.is_outdated]:
+            first = next((fix.stamp for fix in fixes if session.lasted(self._joiner.measured(fix))), None)
+            if first is None:
                 continue
-            first = next((r.stamp for r in records if isinstance(r, Fix) and session.lasted(r.stamp)), None)
-            if first is not None and self._prisms.is_judged_again(session, first):
+            try:
+                self._prisms.judge_again(session, first)
                 self._observing.restore(session)
+            except (OSError, sqlite3.Error, StoreError, MemoryError) as error:
+                session.is_outdated = True
+                log.warning("session %s: earlier fixes cannot be judged again yet: %s", session.id, error)
 
     def _watch_prism(self, fix: Fix) -> None:
         for session in self._taking():
-            if session.lasted(fix.stamp):
+            if session.lasted(self._joiner.measured(fix)):
                 self._prisms.see(session, fix)
 
     def _taking(self) -> list[OpenSession]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import logging
-import sqlite3
 from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
@@ -19,10 +18,9 @@ from daemon.sessions.prisms.identity_loader import IdentityLoader
 from daemon.sessions.prisms.sightings import sightings_of
 from daemon.sessions.prisms.standstill_places import Exclusions
 from daemon.sessions.station_setups import Place
-from daemon.store.errors import StoreError
 from daemon.store.queries.observations import fixes_since_used
 from daemon.store.queries.sessions import SessionTable, prism_confirmations
-from daemon.store.queries.zeros import preset_jumps
+from daemon.store.queries.zeros import newest_jumps
 from daemon.store.store import Store
 from drivers.clock import Clock, Stamp, lies_within
 from drivers.readings import DeviceEvent, EventKind, Fix, LockState, Status
@@ -42,6 +40,7 @@ class PrismWatch:
         clock: clock for the instants of confirmations and events.
         limits: station -> limits of its prism's motion.
         tell: called with each event for the operator, to store it.
+        measured: returns when a fix was measured, which is before it arrived.
     """
 
     def __init__(
@@ -51,8 +50,10 @@ class PrismWatch:
         clock: Clock,
         limits: Mapping[str, MotionLimit],
         tell: Callable[[DeviceEvent], None],
+        measured: Callable[[Fix], Stamp],
     ) -> None:
         self._store, self._rig, self._clock, self._limits, self._keep = store, rig, clock, limits, tell
+        self._measured = measured
         self._table = SessionTable(store, rig.name)
         self._loader = IdentityLoader(rig)
 
@@ -69,9 +70,10 @@ class PrismWatch:
         session.evidence = self._evidence(session)
 
     def _evidence(self, session: OpenSession) -> PrismEvidence:
-        jumps = [jump for jump in preset_jumps(self._store, None) if jump.device in self._rig.joint_names]
+        jumped = [jump.at for jump in newest_jumps(self._store) if jump.device in self._rig.joint_names]
+        since = max(jumped, key=self._store.order, default=None)
         groups: dict[str, list[tuple[str, Mapping[str, float], Place]]] = {}
-        for row in self._table.standstill_observations(session.setup_id, jumps[-1].at if jumps else None):
+        for row in self._table.standstill_observations(session.setup_id, since):
             place_mm = row["x_mm"], row["y_mm"], row["z_mm"]
             groups.setdefault(row["session_id"], []).append((row["prism"], json.loads(row["values_json"]), place_mm))
         earlier = [sightings_of(self._rig, rows) for rows in groups.values()]
@@ -238,18 +240,6 @@ class PrismWatch:
             session.confirmations += [OperatorConfirmation(reader.stamp(row), bool(row["turning"])) for row in rows]
         self.judge_again(session)
 
-    def is_judged_again(self, session: OpenSession, until: Stamp) -> bool:
-        """Do as `judge_again`; return False if that must wait.
-
-        A computer that lacks a descriptor or memory keeps the judgement so far; it is tried again at the next fix.
-        """
-        try:
-            self.judge_again(session, until)
-        except (OSError, sqlite3.Error, StoreError, MemoryError) as error:
-            log.warning("session %s: earlier fixes cannot be judged again yet: %s", session.id, error)
-            return False
-        return True
-
     def judge_again(self, session: OpenSession, until: Stamp | None = None) -> None:
         """Judge the stored fixes of a session anew; the next fix is treated as a new lock.
 
@@ -265,7 +255,7 @@ class PrismWatch:
                     fix = _fix(station, row, reader.stamp(row))
                     if until is not None and lies_within(session.order, fix.stamp, until, None):
                         break
-                    if _is_of_target(session, fix):
+                    if self._is_of_target(session, fix):
                         guard.see(fix)
                         guard.suspect_again(fix.stamp, row["excluded"] or "")
                     else:
@@ -277,10 +267,15 @@ class PrismWatch:
 
     def _take(self, session: OpenSession, fix: Fix) -> DeviceEvent | None:
         guard = self._guard(session, fix.station)
-        if _is_of_target(session, fix):
+        if self._is_of_target(session, fix):
             return guard.see(fix)
         guard.look_away()
         return None
+
+    def _is_of_target(self, session: OpenSession, fix: Fix) -> bool:
+        """Return False for a fix that is known to be of a control point."""
+        place_mm = position_mm(fix)
+        return session.has(self._measured(fix)) and not (place_mm is not None and session.is_control_point(place_mm))
 
     def _guard(self, session: OpenSession, station: str) -> PrismGuard:
         if station not in session.guards:
@@ -290,12 +285,6 @@ class PrismWatch:
     def _new_guard(self, session: OpenSession, station: str) -> PrismGuard:
         limit = self._limits.get(station, MotionLimit())
         return PrismGuard(station, limit, session.confirmations, self._store.order)
-
-
-def _is_of_target(session: OpenSession, fix: Fix) -> bool:
-    """Return False for a fix that is known to be of a control point."""
-    place_mm = position_mm(fix)
-    return session.has(fix.stamp) and not (place_mm is not None and session.is_control_point(place_mm))
 
 
 def _followed(session: OpenSession, joined: JoinedFix) -> tuple[PrismGuard, PrismEvidence, Turn] | None:

@@ -19,7 +19,7 @@ from daemon.store.connection import Connection
 from daemon.store.errors import NotInStoreError
 from daemon.store.queries.sessions import SessionTable
 from daemon.store.queries.time_axis import TimeAxis, time_axis
-from daemon.store.queries.zeros import lost_zeros
+from daemon.store.queries.zeros import Zeros
 from daemon.store.rows import marks
 from drivers.clock import Clock
 
@@ -190,7 +190,7 @@ class ModelTable:
         Returns:
             Device -> number of its newest jump among the store's device events.
         """
-        return lost_zeros(self._store, self._rig, self._sessions.newest_start(model.sessions))
+        return Zeros(self._store, self._rig).lost(self._sessions.newest_start(model.sessions))
 
     def time_axis(self) -> TimeAxis:
         """Return the axis of `time_s` in the store's observations, and so in its models' training data."""

@@ -15,7 +15,7 @@ from daemon.store.errors import NotInStoreError
 from daemon.store.places import between
 from daemon.store.queries.decoding import OLDEST_WAITING
 from daemon.store.queries.observations import Tally, tally_of
-from daemon.store.queries.zeros import lost_zeros, preset_jumps
+from daemon.store.queries.zeros import Zeros, newest_jumps
 from daemon.store.rows import RowSource, marks
 from daemon.store.views import in_session
 from drivers.clock import NS_PER_S, Stamp
@@ -128,6 +128,8 @@ _LAST_MEASURED = """WITH measured AS (SELECT * FROM (
             WHERE (run.started_boot_id, run.started_monotonic_ns) <= (measured.boot_id, measured.monotonic_ns)
             ORDER BY run.id DESC LIMIT 1))
     ORDER BY boot_id DESC, monotonic_ns DESC LIMIT 1"""
+_ZEROS_KNOWN = """started_utc_ns, started_monotonic_ns, started_boot_id,
+        accepted_utc_ns, accepted_monotonic_ns, accepted_boot_id"""  # the columns that `zeros_known` reads
 _OPEN = """SELECT id, started_utc_ns, started_monotonic_ns, started_boot_id FROM calibration_sessions
     WHERE rig = ? AND state = 'open' ORDER BY rowid DESC LIMIT 1"""
 
@@ -208,8 +210,8 @@ class SessionTable:
         if not rows:
             return None
         started = self._store.stamp(rows[0], "started_")
-        jumps = preset_jumps(self._store, started)
-        return OpenSessionRow(rows[0]["id"], started, tuple(sorted({jump.device for jump in jumps})))
+        jumps = newest_jumps(self._store, started)
+        return OpenSessionRow(rows[0]["id"], started, tuple(jump.device for jump in jumps))
 
     def used(self) -> list[dict[str, Any]]:
         """Return id and kind of the rig's closed sessions that calibration may use, oldest first."""
@@ -223,8 +225,8 @@ class SessionTable:
         return next((row["id"] for row in self._store.rows(sql, (session_id,))), None)
 
     def closed(self) -> list[dict[str, Any]]:
-        """Return id, excluded and accepted_despite of the rig's closed sessions, oldest first."""
-        sql = """SELECT id, excluded, accepted_despite FROM calibration_sessions
+        """Return the rig's closed sessions, oldest first: id, excluded, accepted_despite, for `zeros_known`."""
+        sql = f"""SELECT id, excluded, accepted_despite, {_ZEROS_KNOWN} FROM calibration_sessions
             WHERE rig = ? AND state = 'closed' ORDER BY rowid"""
         return self._store.rows(sql, (self._rig,))
 
@@ -252,11 +254,10 @@ class SessionTable:
 
     def zeros_lost(self) -> list[str]:
         """Return devices that jumped, unchecked, since the newest session started that is not aborted or rejected."""
-        sql = """SELECT started_utc_ns, started_monotonic_ns, started_boot_id, accepted_utc_ns, accepted_monotonic_ns,
-                accepted_boot_id FROM calibration_sessions
+        sql = f"""SELECT {_ZEROS_KNOWN} FROM calibration_sessions
             WHERE rig = ? AND state IN ('open', 'closed') AND rejected_utc_ns IS NULL ORDER BY rowid DESC LIMIT 1"""
         rows = self._store.rows(sql, (self._rig,))
-        return [*lost_zeros(self._store, self._rig, self.zeros_known(rows[0]))] if rows else []
+        return [*Zeros(self._store, self._rig).lost(self.zeros_known(rows[0]))] if rows else []
 
     def zeros_known(self, session: Mapping[str, Any]) -> Stamp:
         """Return when the zeros of a session were last known: at its start, or when an operator accepted it."""

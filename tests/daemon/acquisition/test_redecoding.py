@@ -26,7 +26,7 @@ from daemon.store.queries.sessions import SessionTable
 from daemon.store.upkeep.full_samples import stretches_between
 from daemon.store.upkeep.packing import Packing
 from drivers.clock import NS_PER_S, Stamp
-from drivers.readings import Capture
+from drivers.readings import Capture, Fix, Reading
 from tests.bench.store_growth import CONFIG, UTC_0_NS, traffic
 from tests.daemon.support.rig_files import ANOTHER_FACTOR, ANOTHER_ZERO, decoded_rig
 from tests.daemon.support.store import table
@@ -54,7 +54,7 @@ def sent() -> list[list[Capture]]:
     return list(traffic(SECONDS, 1))
 
 
-def stored(path: Path, sent: list[list[Capture]], is_of_session: Callable[[Stamp], bool]) -> Store:
+def stored(path: Path, sent: list[list[Capture]], is_of_session: Callable[[Reading | Fix], bool]) -> Store:
     store = Store(path)
     declare_channels(store, SOURCE.rig)
     decoding, thinning = LinkDecoders(DECODERS), Thinning(is_of_session)

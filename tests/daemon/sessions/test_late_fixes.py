@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
+from daemon.acquisition.thinning import Thinning
 from daemon.sessions.lifecycle import NOT_ENCLOSED
 from drivers.clock import NS_PER_S, Stamp
 from drivers.readings import CanCapture, DeviceEvent, EventKind, Reading, Record
@@ -14,7 +15,22 @@ from tests.daemon.support.store import table
 CONTROL_MM = (9000.0, 500.0, 2000.0)
 
 
-rig = closed_afterwards(Rig)
+class DelayedRig(Rig):
+    """A rig whose station sends each fix a while after it has measured it, and whose records are thinned."""
+
+    link_delay_s: Mapping[str, float] = {"station": 0.3}
+
+    def live(self, seconds: float, **rates: float) -> None:
+        thinning = Thinning(self.keeper.is_of_session)
+        for _ in range(round(seconds / STEP_S)):
+            self.clock.advance(STEP_S)
+            now = self.clock.now()
+            records = [*(Reading(j.name, now, self.values[j.name], j.unit) for j in SOURCE.rig.joints), self.fix()]
+            self.store.insert_records(thinning.kept(records))
+            self.tell(records)
+
+
+rig, delayed = closed_afterwards(Rig), closed_afterwards(DelayedRig)
 
 
 def captured(rig: Rig, seconds: float) -> list[list[Record]]:
@@ -142,3 +158,25 @@ def test_another_prism_stays_suspected_in_a_boot_whose_clock_was_set_back(rig: R
     rig.live(5)
     assert set(used(rig)) == {8000}
     assert len(rig.keeper.prism_suspicions()) == 1
+
+
+def test_fixes_that_arrive_after_a_session_of_which_they_are_keep_their_rows(delayed: DelayedRig) -> None:
+    start(delayed)
+    delayed.live(3)
+    delayed.say("stop")
+    delayed.live(3)
+    observations = table(delayed.store.path, "observations")
+    assert len(observations) > 55
+    assert all(row["fix_id"] is not None for row in observations)
+
+
+def test_a_target_that_was_measured_before_a_sessions_start_is_none_of_its_targets(delayed: DelayedRig) -> None:
+    delayed.say("setup_new", id="S1", instrument="GTS-905A")
+    delayed.target_mm = ANOTHER_MM
+    delayed.live(2)
+    delayed.say("start", prism="r")
+    delayed.live(0.25)
+    delayed.target_mm = PRISM_MM
+    delayed.live(3)
+    assert delayed.keeper.prism_suspicions() == []
+    assert observed(delayed) == {("s001-r", "r", 8000)}

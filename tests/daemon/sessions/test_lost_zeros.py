@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import pytest
 
+from daemon.store.queries.models import ModelTable
 from daemon.store.queries.sessions import ZERO_LOST, SessionTable
-from daemon.store.queries.zeros import lost_zeros
+from daemon.store.queries.zeros import Zeros
 from daemon.store.upkeep.backup import CLOSE_OPEN_SESSIONS
 from drivers.readings import DeviceEvent, EventKind
 from tests.daemon.sessions.test_rig_file_changes import change_rig_file
@@ -147,7 +150,7 @@ def test_a_word_about_a_model_that_is_newer_than_all_jumps_changes_nothing(sessi
     jump(session_rig)
     name = controlled(session_rig)
     check_zeros(session_rig, name)
-    assert list(lost_zeros(session_rig.store, SOURCE.rig.name, early)) == ["theta1"]
+    assert list(Zeros(session_rig.store, SOURCE.rig.name).lost(early)) == ["theta1"]
 
 
 def test_a_session_says_all_that_speaks_against_it(session_rig: Rig) -> None:
@@ -187,3 +190,66 @@ def test_a_session_that_was_left_open_is_not_used_after_zeros_were_lost_and_chec
     check_zeros(session_rig, after)
     assert why in session_rig.say("show", id=name)["not_used"]
     assert used(session_rig) == [after]
+
+
+# ---- what it costs ---------------------------------------------------------------------------------------------------
+
+
+def flap(rig: Rig, times: int) -> None:
+    """Have an encoder with a loose contact jump at so many frames."""
+    events = []
+    for _ in range(times):
+        rig.clock.advance(0.05)
+        events.append(DeviceEvent("theta4", rig.clock.now(), EventKind.PRESET_JUMP, "position jumped"))
+    rig.store.insert_records(events)
+
+
+def steps_of(rig: Rig, work: Callable[[], object]) -> int:
+    """Return the number of steps of SQLite's virtual machine; unlike time it is always the same."""
+    steps = 0
+
+    def count() -> int:
+        nonlocal steps
+        steps += 100
+        return 0
+
+    with rig.store.transaction() as db:
+        db.conn.set_progress_handler(count, 100)
+        work()
+        db.conn.set_progress_handler(None, 0)
+    return steps
+
+
+def test_an_encoder_that_jumps_at_every_frame_costs_no_more_after_many_jumps(session_rig: Rig) -> None:
+    name, store = controlled(session_rig), session_rig.store
+    jump(session_rig, "theta4", 0.0)
+    check_zeros(session_rig, name)
+    (row,) = store.rows("SELECT * FROM calibration_sessions")
+    with store.transaction():
+        for number in range(299):
+            store.insert("calibration_sessions", row | {"id": f"copy {number}"})
+    session_rig.say("start", prism="r")
+    (opened,) = session_rig.keeper._taking()[-1:]
+    sessions, models = SessionTable(store, SOURCE.rig.name), ModelTable(store, SOURCE.rig.name, session_rig.clock)
+    model = models.live()
+    assert model is not None
+    looks: dict[str, Callable[[], object]] = {
+        "a jump is stored": lambda: jump(session_rig, "theta4", 0.0),
+        "alarms": lambda: (sessions.open_session(), sessions.zeros_lost()),
+        "the live model": lambda: models.jumped(model),
+        "a start or a located point": lambda: session_rig.keeper._prisms._evidence(opened),
+        "a restart": session_rig.new_keeper,
+    }
+    jump(session_rig, "theta4", 0.0)  # which takes all sessions away
+    few = {name: steps_of(session_rig, look) for name, look in looks.items()}
+    flap(session_rig, 20_000)
+    many = {name: steps_of(session_rig, look) for name, look in looks.items()}
+    assert all(many[name] <= 1.05 * few[name] + 500 for name in looks), (few, many)
+    assert many["a jump is stored"] < 50_000, "of 300 closed sessions"
+    assert sessions.zeros_lost() == ["theta4"]
+    assert used(session_rig) == []
+    store.update("models", {"id": model.id}, {"state": "retired"})
+    check_zeros(session_rig, name)
+    assert steps_of(session_rig, looks["alarms"]) <= few["alarms"] + 500, "although an earlier word is asked for"
+    assert sessions.zeros_lost() == [] == [*models.jumped(model)]
+    assert not session_rig.say("show", id="copy 7")["not_used"].startswith(ZERO_LOST)

@@ -7,7 +7,7 @@ import math
 import resource
 import sqlite3
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -45,12 +45,14 @@ class Rig:
     Attributes:
         stations: names of the configured stations; the first one measures.
         steps_of_fix: the station gives a fix in every so many steps.
+        link_delay_s: station -> how long before its fix arrives it was measured.
         machine: what a new keeper takes for the machine.
         runs: how many keepers there have been; each is of a new run of the daemon.
         observing: surrounds the making of observations from records that are stored.
     """
 
     steps_of_fix = 1
+    link_delay_s: Mapping[str, float] = {}
     stations: Sequence[str] = ("station",)
     machine = SOURCE.rig
     runs = 0
@@ -74,7 +76,9 @@ class Rig:
 
     def new_keeper(self, aim: Callable[[str], None] | None = None) -> SessionManager:
         self.runs += 1
-        joiner = ObservationJoiner(joint_inputs(self.machine), signal_inputs(self.machine), settle_s=0.5)
+        joiner = ObservationJoiner(
+            joint_inputs(self.machine), signal_inputs(self.machine), link_delay_s=self.link_delay_s, settle_s=0.5
+        )
         return SessionManager(
             self.machine,
             self.machine.text,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import logging
 import resource
 
 import numpy as np
@@ -173,6 +174,37 @@ def test_a_session_that_cannot_be_judged_again_for_lack_of_descriptors_keeps_its
     rig.live(3.0)
     assert not opened.is_outdated
     assert_is_suspected(rig, session, of_the_prism)
+
+
+def test_a_batch_has_its_observations_although_descriptors_run_out_while_its_session_is_judged_again(
+    rig: TrueRig,
+) -> None:
+    rig.say("start", prism="r")
+    rig.stand(0, "r", 2.5)
+    look_at_a_reflector(rig)
+    (opened,) = rig.keeper._taking()
+    opened.is_outdated = True
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    before = len(table(rig.store.path, "observations"))
+
+    class TakesTheLast(logging.Handler):
+        """Takes the last descriptors once the guards have been judged, as another thread may."""
+
+        def emit(self, record: logging.LogRecord) -> None:
+            resource.setrlimit(resource.RLIMIT_NOFILE, (3, hard))
+
+    log, taker = logging.getLogger("daemon.sessions.prism_watch"), TakesTheLast()
+    log.addHandler(taker)
+    try:
+        rig.live(1.0)
+    finally:
+        log.removeHandler(taker)
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+    assert len(table(rig.store.path, "observations")) == before + 20
+    assert opened.is_outdated, "it is tried again"
+    rig.live(1.0)
+    assert not opened.is_outdated
+    assert len(rig.keeper.prism_suspicions()) == 1
 
 
 def test_the_prism_that_is_found_again_at_other_poses_counts_once_these_show_where_the_base_stands(
