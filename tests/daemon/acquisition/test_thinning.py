@@ -40,7 +40,8 @@ def test_one_reading_of_each_channel_and_one_fix_a_second_are_kept() -> None:
 
 def test_in_a_session_and_only_there_all_are_kept() -> None:
     records = [reading("theta1", n / 100, 1.0) for n in range(500)]
-    kept = Thinning(lambda stamp: at(2.0).monotonic_ns <= stamp.monotonic_ns < at(3.0).monotonic_ns).kept(records)
+    third_second = range(at(2.0).monotonic_ns, at(3.0).monotonic_ns)
+    kept = Thinning(lambda record: record.stamp.monotonic_ns in third_second).kept(records)
     seconds = seconds_of(kept)
     assert [seconds.count(second) for second in range(5)] == [1, 1, 100, 1, 1]
 
