@@ -48,7 +48,7 @@ class Limits:
         clients: largest number of clients at a time.
         line_s: wait for the end of a request that has begun.
         idle_s: wait for the start of the next request.
-        send_s: wait for an answer to be read.
+        send_s: wait for a further part of an answer to be read.
         give_way_s: when all places are taken, a client that for this long has sent no complete request, or has not read
             an answer, is disconnected.
     """
@@ -254,10 +254,7 @@ class ControlServer:
                 caller = _peer_of(client.connection)
                 while (line := self._next_line(client)) is not None:
                     answer = self._answer(line, caller, lambda: _is_closed_by_peer(client.connection))
-                    with self._lock:
-                        client.waiting_ns = self._clock.monotonic_ns()
-                    client.connection.settimeout(self._limits.send_s)
-                    client.connection.sendall(answer)
+                    self._send(client, answer)
                     if len(line) > MAX_LINE_BYTES:
                         return
         except OSError:
@@ -265,6 +262,15 @@ class ControlServer:
         finally:
             with self._lock:
                 self._clients.discard(client)
+
+    def _send(self, client: _Client, answer: bytes) -> None:
+        """Send an answer; a client waits only while it takes nothing of it."""
+        client.connection.settimeout(self._limits.send_s)
+        left = memoryview(answer)
+        while left:
+            with self._lock:
+                client.waiting_ns = self._clock.monotonic_ns()
+            left = left[client.connection.send(left) :]
 
     def _next_line(self, client: _Client) -> bytes | None:
         """Return the client's next request; None if the client has closed, was disconnected or exceeded a limit."""

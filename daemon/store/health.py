@@ -12,7 +12,7 @@ import os
 import shutil
 import sqlite3
 import threading
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -57,8 +57,8 @@ class StoreHealth:
         since: when it entered this state.
         free_bytes: free space on the store's disk; None if the file system cannot be read.
         is_low: less than 1 GiB is free, or less than both 5 % of the disk and 10 GiB.
-        log_reader: another process that keeps the store's log from being emptied, which has grown for that reason; None
-            if there is none.
+        log_fault: why the store's log, which has grown long, cannot be emptied, a clause; "" if it can.
+        is_log_stuck: the log needs more free space to be emptied than there is.
     """
 
     state: HealthState
@@ -66,7 +66,8 @@ class StoreHealth:
     since: Stamp
     free_bytes: int | None
     is_low: bool
-    log_reader: str | None = None
+    log_fault: str = ""
+    is_log_stuck: bool = False
 
     @property
     def is_unsound(self) -> bool:
@@ -81,7 +82,7 @@ class StoreHealth:
             "since_utc_ns": self.since.utc_ns,
             "free_bytes": self.free_bytes,
             "is_low": self.is_low,
-            "log_reader": self.log_reader,
+            "log_fault": self.log_fault,
         }
 
 
@@ -128,11 +129,11 @@ class StoreWatch:
         """Check files and free space; takes microseconds, unless the file system hangs."""
         state, text = self._state()
         free_bytes, is_low = _space(self._store.path.parent)
-        before, reader = self.health, self._log_reader()
+        before = self.health
+        since = before.since if state == before.state else self._clock.now()
+        self.health = StoreHealth(state, text, since, free_bytes, is_low, *self._log_fault(free_bytes))
         if state == before.state:
-            self.health = replace(before, text=text, free_bytes=free_bytes, is_low=is_low, log_reader=reader)
             return
-        self.health = StoreHealth(state, text, self._clock.now(), free_bytes, is_low, reader)
         if text:
             log.log(logging.INFO if state == "checking" else logging.CRITICAL, "%s", text)
         else:
@@ -167,11 +168,20 @@ class StoreWatch:
             )
         return "ok", ""
 
-    def _log_reader(self) -> str | None:
-        with contextlib.suppress(OSError):
-            if log_bytes(self._store.path) > LONG_LOG_BYTES:
-                return reader_of(self._store.path)
-        return None
+    def _log_fault(self, free_bytes: int | None) -> tuple[str, bool]:
+        """Return why a long log cannot be emptied, and whether there is too little free space for that."""
+        try:
+            size_bytes = log_bytes(self._store.path)
+        except OSError:
+            return "", False
+        if size_bytes <= LONG_LOG_BYTES:
+            return "", False
+        reader = reader_of(self._store.path)
+        is_stuck = free_bytes is not None and free_bytes < size_bytes
+        reasons = [f"{reader} does not finish reading the store"] if reader is not None else []
+        if is_stuck:
+            reasons.append(f"that may need {size_bytes / 2**20:.0f} MiB of free space, and the disk has less")
+        return "; ".join(reasons), is_stuck
 
     def _copies(self) -> str:
         """Return shell commands that copy the open files, which have lost their names; "" if they are not found."""

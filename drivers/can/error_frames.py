@@ -10,7 +10,7 @@ from drivers.readings import DeviceEvent, EventKind
 ERROR_REPEAT_NS = 10 * NS_PER_S
 """Minimum interval between reports of errors that do not change the controller's state; a report has their count."""
 
-STATE_REPEAT_NS = NS_PER_S
+STATE_REPEAT_NS = 4 * NS_PER_S
 """Minimum interval between reports of the same state of the controller; a repeated state is reported after it."""
 
 # Error class, in the identifier

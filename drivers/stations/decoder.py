@@ -24,7 +24,7 @@ from drivers.stations.replies import Reply
 from drivers.stations.survey import position_mm, range_checked
 
 _UNFINISHED_NS = 2 * NS_PER_S  # an unfinished record is discarded after this, even if no more bytes arrive
-_PAUSE_NS = 150 * NS_PER_S // 1000  # a record has no longer pause; a port takes longer to be reopened (SETTLE_S)
+_PAUSE_NS = NS_PER_S // 2  # a record has no longer pause, and no one plugs an adapter in more quickly
 
 Point = tuple[float, float, float]
 

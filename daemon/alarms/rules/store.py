@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 from daemon.alarms.alarm import Finding, rule
 from daemon.alarms.evidence import Evidence
+from daemon.monitoring.notice import Severity
 from drivers.clock import NS_PER_S
 
 CRITICAL_BYTES = 200 * 2**20
@@ -108,8 +109,8 @@ def backup_overdue(evidence: Evidence) -> Iterator[Finding]:
 
 @rule(
     "warning",
-    "End the process, or close the query that it has left open. A program that watches the store for long should open "
-    "it anew for each query.",
+    "End the process that the alarm names, or close the query that it has left open: a program that watches the store "
+    "should open it anew for each query. Where space is short, free as much as the alarm says.",
     after_s=30.0,
     hold_s=60.0,
 )
@@ -117,11 +118,13 @@ def store_log_grows(evidence: Evidence) -> Iterator[Finding]:
     """Another program has been reading the store for so long that its log (`-wal`) is larger than 256 MiB.
 
     SQLite cannot empty the log while a transaction or a cursor is left open, so it takes up all the disk in time.
-    Deletion of old captures would give no space back, and does not begin. Cleared a minute after the log can be
-    emptied, or when no other process reads the store.
+    Deletion of old captures would give no space back, and does not begin. Critical once less space is free than the log
+    takes: its pages are first written to the database, which may grow by as much. Cleared a minute after the log can
+    be emptied, or is shorter.
     """
-    if evidence.store is not None and evidence.store.log_reader is not None:
-        yield "store", f"the store's log grows because {evidence.store.log_reader} does not finish reading the store"
+    if (store := evidence.store) is not None and store.log_fault:
+        severity: Severity = "critical" if store.is_log_stuck else "warning"
+        yield "store", f"the store's log grows and cannot be emptied: {store.log_fault}", severity
 
 
 @rule("warning", "Free space on the disk of the store.", hold_s=60.0)

@@ -64,8 +64,8 @@ class Room:
     Attributes:
         disk_bytes: free space on its disk.
         inside_bytes: free pages in the store's file.
-        log_bytes: space that the store's log takes while a reader keeps it from being emptied. It becomes free when the
-            reader ends, and not by any deletion.
+        log_bytes: space that the store's log takes while a reader keeps it from being emptied, and that no deletion
+            frees; it becomes free once the reader ends and the log can be written to the database.
         least_bytes: smallest sum of these; below it the oldest data are deleted.
     """
 

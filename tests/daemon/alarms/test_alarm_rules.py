@@ -103,9 +103,9 @@ def store_health(
     free_bytes: int | None = None,
     *,
     is_low: bool = False,
-    log_reader: str | None = None,
+    log_fault: str = "",
 ) -> StoreHealth:
-    return StoreHealth(state, text, NOW, free_bytes, is_low, log_reader)
+    return StoreHealth(state, text, NOW, free_bytes, is_low, log_fault)
 
 
 def missing(lately: int, share: float) -> GapCount:
@@ -362,7 +362,7 @@ CASES: dict[str, list[tuple[Evidence, list[str], Evidence]]] = {
         ),
     ],
     "store_log_grows": [
-        (known(store=store_health(log_reader="process 7 (python3)")), ["store"], known(store=store_health())),
+        (known(store=store_health(log_fault="process 7 (python3) reads")), ["store"], known(store=store_health())),
     ],
     "disk_nearly_full": [
         (known(store=store_health(is_low=True)), ["store"], known(store=store_health(free_bytes=10**10))),

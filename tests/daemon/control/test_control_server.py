@@ -146,6 +146,21 @@ def test_clients_that_read_no_answer_do_not_lock_the_operator_out(tmp_path: Path
         wait("a place", lambda: answers(tmp_path / "s"))
 
 
+def test_a_client_that_goes_on_reading_a_long_answer_gets_the_whole_of_it(tmp_path: Path) -> None:
+    long = "x" * 5_000_000
+    with serving(tmp_path / "s", {"echo": echo, "long": lambda _: long}, clients=1, give_way_s=0.2):
+        with connected(tmp_path / "s", b'{"command": "long"}\n') as client:
+            answer = bytearray()
+            others = 0
+            while not answer.endswith(b"\n"):
+                answer += client.recv(200_000)
+                if len(answer) // 1_000_000 > others:  # another client asks for a place every while
+                    others += 1
+                    assert not answers(tmp_path / "s")
+            assert json.loads(answer)["result"] == long
+        wait("a place", lambda: answers(tmp_path / "s"))
+
+
 def test_an_idle_client_is_closed(tmp_path: Path) -> None:
     with serving(tmp_path / "s", idle_s=0.2), connected(tmp_path / "s") as idle:
         assert idle.recv(1) == b""

@@ -57,13 +57,17 @@ def test_a_log_that_grows_behind_a_reader_is_told_with_the_process(path: Path, m
         monkeypatch.setattr(health, "LONG_LOG_BYTES", log_bytes(path) + 100_000)
         with reading(path) as pid:
             watch.look()
-            assert watch.health.log_reader is None
+            assert watch.health.log_fault == ""
             while log_bytes(path) <= health.LONG_LOG_BYTES:
                 store_some(store)
             watch.look()
-            assert f"process {pid} " in str(watch.health.log_reader)
+            assert f"process {pid} " in watch.health.log_fault
+            assert not watch.health.is_log_stuck
+            monkeypatch.setattr(health, "_space", lambda _: (log_bytes(path) - 1, True))
+            watch.look()
+            assert watch.health.is_log_stuck
         watch.look()
-        assert watch.health.log_reader is None
+        assert watch.health.log_fault.startswith("that may need"), "the log is still long"
 
 
 def test_a_store_without_a_log_has_neither_size_nor_reader(path: Path) -> None:

@@ -147,6 +147,7 @@ def test_a_record_cut_by_unplugging_is_not_completed_by_what_comes_after_pluggin
         instrument.send(first[:12])
         collected.wait_for_bytes(12)
         instrument.unplug()
+        time.sleep(0.6)
         instrument.plug_in()
         collected.wait_for_event(EventKind.LINK_UP, 2)
         instrument.send(second[12:])
