@@ -9,7 +9,7 @@ from drivers.can.channel import ChannelDecoder, without_time
 from drivers.can.error_frames import BusErrors
 from drivers.can.j1939 import J1939Id
 from drivers.can.summary import CanSummary, IdSummary, RateWindow
-from drivers.canopen.cia301 import Service, classify
+from drivers.canopen.cia301 import Service, classify, sdo_request_id
 from drivers.canopen.node_setup import NodeSetup
 from drivers.canopen.pdo_channel import PdoChannelDecoder
 from drivers.canopen.supervision import NodeSupervision
@@ -35,7 +35,8 @@ class CanDecoder:
     Args:
         link: name of the link.
         channels: decoders of its channels. The nodes of CANopen channels are supervised (see NodeSupervision).
-        setups: set-ups of these nodes; of several for one node the last one counts, as for `CanLink`.
+        setups: set-ups of those nodes that rigcal may set up; of several for one node the last one counts, as for
+            `CanLink`.
     """
 
     def __init__(self, link: str, channels: Iterable[ChannelDecoder], setups: Iterable[NodeSetup] = ()) -> None:
@@ -46,6 +47,7 @@ class CanDecoder:
         self._unlisted = _Entry()
         self._channels: list[_ChannelState] = []
         self._nodes: list[NodeSupervision] = []
+        self._requests: dict[int, NodeSupervision] = {}  # by the identifier of SDO requests to the node
         self._bus_errors = BusErrors(link)
         self._sync: Stamp | None = None
         self._started = False
@@ -61,6 +63,7 @@ class CanDecoder:
         for node, decoders in nodes.items():
             supervision = NodeSupervision(node, decoders, expected.get(node))
             self._nodes.append(supervision)
+            self._requests[sdo_request_id(node)] = supervision
             for arbitration_id, handler in supervision.handlers.items():
                 self._entry(arbitration_id, False).handler = handler
 
@@ -91,10 +94,12 @@ class CanDecoder:
         key = capture.arbitration_id
         if key == SYNC_ID and not capture.is_extended:
             self._sync = stamp  # including rigcal's own SYNC: it marks an instant and is not a reading
-        if capture.is_transmitted:
-            return ()
         if capture.is_extended:
             key |= _EXTENDED
+        if capture.is_transmitted:
+            if key in self._requests:
+                self._requests[key].requested(stamp, capture.data)
+            return ()
         entry = self._entries.get(key)
         if entry is None:
             entry = self._new_unknown(key)

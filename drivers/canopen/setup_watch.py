@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 
 from drivers.canopen.node_setup import (
+    ANSWER_TIMEOUT_NS,
+    ATTEMPTS,
     DEVICE_TYPE,
     NOT_USED,
     Findings,
@@ -14,7 +16,8 @@ from drivers.canopen.node_setup import (
     next_transfer,
     setup_script,
 )
-from drivers.canopen.sdo import AbortResponse, SdoExchange, UploadResponse, decode_response
+from drivers.canopen.sdo import SdoExchange, encode_upload
+from drivers.clock import Stamp
 from drivers.errors import DeviceError
 from drivers.readings import DeviceEvent, EventKind
 
@@ -22,39 +25,46 @@ _SERIAL_NUMBER = re.compile(r"serial number ([0-9A-F]+)h")
 
 
 class SetupWatch:
-    """Follows the set-ups of one node by the node's SDO answers, from which it draws the same conclusions as a set-up.
+    """Follows rigcal's set-ups of one node by the SDO messages on the bus, and draws the same conclusions as a set-up.
 
-    It needs no messages from the set-up itself, so a recording of the bus shows the same as the bus did.
+    A set-up begins with rigcal's own request for object 1000h. What another master reads from the node shows nothing.
+    Everything follows from the messages on the bus, so a recording of them shows the same as the bus did.
 
     Args:
         setup: expected identity and settings of the node.
 
     Attributes:
         is_mismatched: a set-up has shown that the node is not the device in the rig file, and none has succeeded since.
-            A set-up that fails for a different reason, such as no answer, shows nothing.
+            A set-up that fails for a different reason, such as no answer, does not change this.
     """
 
     def __init__(self, setup: NodeSetup) -> None:
         self.name = setup.name
         self.is_mismatched = False
         self._setup = setup
-        self._serial_number: int | None = None  # at the last set-up that showed no wrong device; None if unknown
+        self._serial_number: int | None = None  # that was read last; None if unknown
         self._found = Findings()
         self._script: Script
         self._exchange: SdoExchange | None = None  # None while no set-up is in progress
+        self._requested: Stamp  # time of the last request
 
-    def feed(self, data: bytes) -> str | None:
-        """Process an SDO message from the node.
-
-        Returns:
-            If it ends a set-up of a different device than the last one, the serial numbers of both in words.
-        """
-        if _is_device_type(data):  # every set-up begins with it
+    def requested(self, stamp: Stamp, data: bytes) -> None:
+        """Process an SDO request that rigcal has sent to the node."""
+        self._requested = stamp
+        if data == encode_upload(DEVICE_TYPE, 0):  # every set-up begins with it
             self._found = Findings()
             self._script = setup_script(self._setup, self._found)
             self._step(None)
+
+    def feed(self, stamp: Stamp, data: bytes) -> str | None:
+        """Process an SDO message from the node.
+
+        Returns:
+            If it shows a different device than the last set-up, the serial numbers of both in words.
+        """
         exchange = self._exchange
-        if exchange is None:
+        # A set-up does not wait longer: it has ended, and another master reads
+        if exchange is None or stamp.since(self._requested) > ATTEMPTS * ANSWER_TIMEOUT_NS:
             return None
         try:
             exchange.feed(data)
@@ -63,50 +73,35 @@ class SetupWatch:
         return None if exchange.result is None else self._step(exchange.result)
 
     def booted(self) -> None:
-        """End a set-up in progress, because the node has booted."""
-        self._exchange = None
+        """End a set-up in progress, because the node has booted, unless nothing was read from the node yet."""
+        if self._exchange is not None and self._exchange.transfer.index != DEVICE_TYPE:
+            self._exchange = None
 
     def recall(self, event: DeviceEvent) -> None:
-        """Restore what a set-up has shown before this watch was created, from its CONFIGURED or ALARM event."""
+        """Restore what a set-up has shown before this watch was created, from its CONFIGURED, ALARM or PRESET_JUMP."""
+        if event.kind is EventKind.ALARM:
+            self.is_mismatched |= event.text.endswith(NOT_USED)
+            return
+        found = _SERIAL_NUMBER.search(event.text)
+        self._serial_number = int(found[1], 16) or None if found else None
         if event.kind is EventKind.CONFIGURED:
             self.is_mismatched = False
-            found = _SERIAL_NUMBER.search(event.text)
-            self._serial_number = int(found[1], 16) or None if found else None
-        elif event.text.endswith(NOT_USED):
-            self.is_mismatched = True
 
     def _step(self, outcome: bytes | DeviceError | None) -> str | None:
         """Go on with the set-up until its next transfer or its end, and return the result of `feed`."""
         self._exchange = None
         try:
             transfer = next_transfer(self._script, outcome, lambda _: None)
+            self._exchange = SdoExchange(self._setup.where, transfer)
         except StopIteration:
             self.is_mismatched = False
-            exchanged = self._exchanged()
             self._serial_number = self._found.serial_number
-            return exchanged
         except MismatchError:
-            self.is_mismatched = True  # no value is used, so a serial number that is not the last one loses nothing
-            return None
+            self.is_mismatched = True
         except DeviceError:
-            return None if self.is_mismatched else self._exchanged()
-        self._exchange = SdoExchange(self._setup.where, transfer)
-        return None
-
-    def _exchanged(self) -> str | None:
+            pass  # the set-up has failed
         found, known = self._found.serial_number, self._serial_number
-        if found is None or known is None or found == known:
+        if found is None or found == known:
             return None
         self._serial_number = found
-        return f"serial number {found:X}h, before {known:X}h"
-
-
-def _is_device_type(data: bytes) -> bool:
-    try:
-        response = decode_response(data)
-    except ValueError:
-        return False
-    return isinstance(response, UploadResponse | AbortResponse) and (response.index, response.subindex) == (
-        DEVICE_TYPE,
-        0,
-    )
+        return None if known is None else f"serial number {found:X}h, before {known:X}h"

@@ -19,6 +19,9 @@ HEARTBEAT_TOLERANCE = 2.5  # producer times; allows for two lost heartbeats and 
 VOIDS = "its values are not used until it takes this back"
 """End of an emergency's text while this or an earlier emergency makes the node's values invalid; `recall` needs it."""
 
+EXCHANGED = "a different device answers than at its last set-up"
+"""Part of the text of a PRESET_JUMP that states a node's new serial number; `recall` needs the newest one."""
+
 _REGISTER_DEVICE_PROFILE = 1 << 5
 _CLASS_HARDWARE = 0x5000
 
@@ -35,8 +38,9 @@ class NodeSupervision:
     00xxh with an error register of zero, or a boot-up, makes the values valid again. A code 00xxh with bits left in the
     register means that one of several errors has cleared, but not which one (CiA 301, emergency state transitions).
 
-    A set-up that finds a different device than the rig file describes makes the values invalid until a set-up succeeds.
-    If the serial number is not that of the last set-up, the zeros of the node's joints count as lost.
+    A set-up by rigcal that finds a different device than the rig file describes makes the values invalid until a set-up
+    succeeds. If the serial number that it reads is not the one read last, the zeros of the node's joints count as lost,
+    whether the set-up succeeds or not.
 
     Args:
         node: node number.
@@ -72,16 +76,20 @@ class NodeSupervision:
 
         Returns:
             The event under the current name of the node, or of each channel whose alarms or warnings it restores; empty
-            if it is about a different node or changes nothing.
+            if it is about a different node, changes nothing, or is a PRESET_JUMP, of which only the serial number is
+            restored.
         """
-        is_of_setup = event.kind is EventKind.CONFIGURED or (event.kind is EventKind.ALARM and event.code is None)
+        is_jump = event.kind is EventKind.PRESET_JUMP
+        is_of_setup = (
+            is_jump or event.kind is EventKind.CONFIGURED or (event.kind is EventKind.ALARM and event.code is None)
+        )
         about = (f"node {self.node}:", f"node {self.node} ")
         if is_of_setup and self._setups is not None:
             if not event.text.startswith((*about, f"{event.device} (node {self.node}):")):
                 return []
             self._setups.recall(event)
             self._mark()
-            return [replace(event, device=self._setups.name)]
+            return [] if is_jump else [replace(event, device=self._setups.name)]
         if is_of_setup or not event.text.startswith(about):
             return []
         if event.kind in (EventKind.ALARM, EventKind.WARNING):
@@ -98,6 +106,11 @@ class NodeSupervision:
             self._is_lost = event.kind is EventKind.HEARTBEAT_LOST
         self._mark()
         return [replace(event, device=self._name)]
+
+    def requested(self, stamp: Stamp, data: bytes) -> None:
+        """Process an SDO request that rigcal has sent to the node."""
+        if self._setups is not None:
+            self._setups.requested(stamp, data)
 
     def tick(self, now: Stamp) -> list[Record]:
         """Return the event of an overdue heartbeat, once."""
@@ -170,7 +183,7 @@ class NodeSupervision:
             response = decode_response(data)
         except ValueError:
             return []  # block transfer or similar; no reading depends on it
-        exchanged = None if self._setups is None else self._setups.feed(data)
+        exchanged = None if self._setups is None else self._setups.feed(stamp, data)
         self._mark()
         if exchanged is not None:
             return self._exchanged(stamp, exchanged)
@@ -182,8 +195,8 @@ class NodeSupervision:
     def _exchanged(self, stamp: Stamp, serial_numbers: str) -> list[Record]:
         """Return the events that report that the zeros of the node's joints belong to a different device."""
         text = (
-            f"node {self.node}: a different device answers than at its last set-up ({serial_numbers}), so the joint's "
-            "zero is no longer valid: check the zero, then confirm it by `rigcal model zeros-checked`"
+            f"node {self.node}: {EXCHANGED} ({serial_numbers}), so the joint's zero is "
+            "no longer valid: check the zero, then confirm it by `rigcal model zeros-checked`"
         )
         joints = [channel.name for channel in self._channels if channel.is_joint]
         return [DeviceEvent(name, stamp, EventKind.PRESET_JUMP, text) for name in joints]

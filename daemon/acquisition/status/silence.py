@@ -9,8 +9,9 @@ from drivers.canopen.cia301 import NmtState, heartbeat_id
 from drivers.readings import EventKind
 
 START_NODES = (
-    "Run `rigcal devices configure` while the machine is parked. A node that is set up for SYNC also needs SYNC on the "
-    "bus, from the control system or by the link's `sync_period_ms`."
+    "Run `rigcal devices configure` while the machine is parked, where the link may transmit; otherwise the control "
+    "system must start it. A node that is set up for SYNC also needs SYNC on the bus, from the control system or by "
+    "the link's `sync_period_ms`."
 )
 """What to do about a channel whose node lives but sends no values."""
 

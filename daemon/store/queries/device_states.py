@@ -7,7 +7,7 @@ from typing import Any
 from daemon.store.connection import Connection
 from daemon.store.reader import Reader
 from drivers.canopen.node_setup import NOT_USED
-from drivers.canopen.supervision import VOIDS
+from drivers.canopen.supervision import EXCHANGED, VOIDS
 from drivers.clock import Stamp
 from drivers.readings import DeviceEvent, EventKind
 
@@ -41,7 +41,8 @@ def device_states(source: Connection | Reader, before: Stamp) -> list[DeviceEven
 
     For emergencies both the last one and the last one that voids values are returned. Of set-ups, the last one that
     succeeded and the last one that has failed since are returned, also from earlier boots, and the last one since that
-    found a wrong device. Other alarms and warnings without a code were not sent by the devices, and are left out.
+    found a wrong device or a different serial number. Other alarms and warnings without a code were not sent by the
+    devices, and are left out.
 
     Args:
         source: the store.
@@ -71,7 +72,10 @@ def _set_ups(source: Connection | Reader, device: str, before: tuple[int, int]) 
     of_node, failed = "text LIKE '% (node %'", "code IS NULL"  # a station is configured, too
     rows = list(source.rows(_LAST_OF_SET_UPS.format(of_node), (device, EventKind.CONFIGURED.value, *before, 0, 0)))
     since = (rows[0]["boot_id"], rows[0]["monotonic_ns"]) if rows else (0, 0)
+    jumped = (device, EventKind.PRESET_JUMP.value, *before, *since, EXCHANGED)
+    rows += source.rows(_LAST_OF_SET_UPS.format("text LIKE '%' || ? || '%'"), jumped)
     about = (device, EventKind.ALARM.value, *before, *since)
-    rows += source.rows(_LAST_OF_SET_UPS.format(failed), about)
-    rows += source.rows(_LAST_OF_SET_UPS.format(f"{failed} AND text LIKE '%' || ?"), (*about, NOT_USED))
+    if last := list(source.rows(_LAST_OF_SET_UPS.format(failed), about)):  # else a second search is in vain, too
+        rows += last
+        rows += source.rows(_LAST_OF_SET_UPS.format(f"{failed} AND text LIKE '%' || ?"), (*about, NOT_USED))
     return rows

@@ -13,15 +13,20 @@ from daemon.acquisition.redecoding import redecode
 from daemon.acquisition.status.present import Expected, ExpectedChannel
 from daemon.alarms.evidence import Evidence
 from daemon.alarms.library import library
+from daemon.composition import decoders
+from daemon.config.config import parse_config
+from daemon.rig_files import load_rig
+from daemon.service import declare_channels
 from daemon.store import Store
 from daemon.store.queries.device_states import device_states
 from drivers.can_decoder import CanDecoder
 from drivers.canopen.cia406 import EncoderChannel, EncoderDecoder
 from drivers.canopen.node_setup import NOT_USED, PROFILE_ENCODER, NodeSetup
 from drivers.canopen.pdo import TransmitPdo
-from drivers.canopen.supervision import VOIDS
+from drivers.canopen.supervision import EXCHANGED, VOIDS
 from drivers.clock import SystemClock
 from drivers.readings import CanCapture, DeviceEvent, EventKind
+from tests.bench.store_growth import CONFIG
 from tests.daemon.support.acquisition import ListLink, Make
 from tests.daemon.support.damage import tear
 from tests.daemon.support.store import table
@@ -35,7 +40,8 @@ HARDWARE, OVERRUN, TAKEN_BACK = (
 )
 
 
-# The answers of an encoder of 13 bits to a set-up that expects 16
+# The first request of a set-up that expects 16 bits, and the answers of an encoder of 13
+BEGIN = "620 40 00 10 00 00 00 00 00"
 WRONG_DEVICE = (
     "5A0 43 00 10 00 96 01 02 00",
     *(f"5A0 80 18 10 0{n} 00 00 02 06" for n in (1, 2, 3, 4)),
@@ -181,8 +187,38 @@ def test_a_device_that_its_set_up_found_wrong_is_wrong_after_a_restart_of_daemon
 
 
 def test_a_recording_of_a_set_up_that_found_a_wrong_device_gives_no_values(store: Store, acquire: Make) -> None:
-    heard = [capture(PDO), *(capture(text, 1) for text in WRONG_DEVICE), capture(PDO, 2)]
+    begin = capture(BEGIN, 1, is_transmitted=True)
+    heard = [capture(PDO), begin, *(capture(text, 1) for text in WRONG_DEVICE), capture(PDO, 2)]
     acquire([], DECODERS).run_inline(heard)
+    assert statuses(store) == ["ok", "device_alarm"]
+    assert redecode(store, DECODERS, [(at(0), at(3))]) == 0
+    assert statuses(store) == ["ok", "device_alarm"]
+
+
+def test_the_newest_serial_number_is_told_until_a_set_up_succeeds(store: Store) -> None:
+    exchanged = [
+        DeviceEvent("theta1", at(second), EventKind.PRESET_JUMP, f"node 32: {EXCHANGED} (serial number {second}h, ...")
+        for second in (4, 5)
+    ]
+    jumped = DeviceEvent("theta1", at(6), EventKind.PRESET_JUMP, "position jumped from 1 to 2 deg", 17)
+    store.insert_records([CONFIGURED, *exchanged, jumped])
+    assert device_states(store, at(50)) == [CONFIGURED, exchanged[-1]]
+    again = replace(CONFIGURED, stamp=at(7))
+    store.insert_records([again])
+    assert device_states(store, at(50)) == [again]
+
+
+def test_on_a_link_that_may_not_transmit_neither_reads_nor_earlier_set_ups_void_values(
+    store: Store, acquire: Make
+) -> None:
+    rig = load_rig("swdt82")
+    listening = decoders(parse_config(CONFIG, Path.cwd()), rig)
+    may_send = CONFIG.replace("[[station]]", "allow_transmit = true\ntransmit_nodes = [32]\n[[station]]")
+    sending = decoders(parse_config(may_send, Path.cwd()), rig)
+    declare_channels(store, rig.rig)
+    acquire([], listening).run_inline([REFUSED, capture("5A0 43 00 10 00 92 01 02 00", 4), capture(PDO, 5)])
+    assert statuses(store) == ["ok"]
+    acquire([], sending).run_inline([capture(PDO, 50)])
     assert statuses(store) == ["ok", "device_alarm"]
 
 

@@ -132,6 +132,7 @@ def test_a_silent_joint_whose_node_lives_asks_to_start_it_and_not_to_check_its_c
     assert alarm.severity == "critical"
     assert alarm.text == f"theta1 is no longer received (last: ok){f': {why}' if why else ''}"
     assert ("`rigcal devices configure`" in alarm.remedy) is bool(why)
+    assert ("where the link may transmit" in alarm.remedy) is bool(why)
     assert ("cable" in alarm.remedy) is (not why)
     status = asdict(joint.status())
     (found, *_) = [one for one in channel_findings(status["channels"], "") if "theta1" in one.text]
