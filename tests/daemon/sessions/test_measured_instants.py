@@ -6,6 +6,7 @@ from collections import deque
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -13,6 +14,7 @@ from daemon.sessions.prisms.standstill_places import ELSEWHERE
 from drivers.readings import Fix
 from tests.daemon.sessions.test_prism_watch import ANOTHER_MM, PRISM_MM, reasons, used
 from tests.daemon.support.sessions import STEP_S, Rig, closed_afterwards, start
+from tests.daemon.support.store import table
 
 CONTROL_MM = (9000.0, 500.0, 2000.0)
 BESIDE_MM = (3000.0, 8200.0, 1000.0)  # 0.2 m from the prism: no jump that a guard suspects
@@ -40,6 +42,9 @@ class LateRig(Rig):
 
     def _aim(self, target: str) -> None:
         self.target_mm = CONTROL_MM if target == "cp1" else PRISM_MM
+
+    def shoot_where_it_is(self) -> Any:
+        return self.shoot("cp1", self.target_mm)
 
 
 rig = closed_afterwards(LateRig)
@@ -108,3 +113,32 @@ def test_within_a_standstill_only_fixes_measured_after_a_confirmation_decide_whe
     assert before > 20
     assert set(used(rig)) == {8000}
     assert any(reason.startswith(ELSEWHERE) for reason in reasons(rig))
+
+
+@pytest.mark.parametrize("is_aimed", [False, True])
+def test_a_control_point_is_located_by_fixes_measured_after_the_station_was_turned_to_it(
+    rig: LateRig, is_aimed: bool
+) -> None:
+    if is_aimed:
+        rig.new_aiming_keeper()
+    start(rig)
+    rig.live(3)
+    if not is_aimed:
+        rig.target_mm = CONTROL_MM  # by the operator, who has not waited for fixes of it
+    shot = rig.shoot_where_it_is()
+    assert (shot["x_mm"], shot["y_mm"], shot["z_mm"]) == pytest.approx(CONTROL_MM)
+    (point,) = table(rig.store.path, "control_points")
+    assert (point["x_mm"], point["y_mm"], point["z_mm"]) == pytest.approx(CONTROL_MM)
+
+
+def test_fixes_measured_in_a_shot_that_arrive_after_its_end_are_not_of_the_prism(rig: LateRig) -> None:
+    rig.new_aiming_keeper()
+    start(rig)
+    rig.live(3)
+    before = len(used(rig))
+    rig.shoot_where_it_is()
+    rig.target_mm = PRISM_MM
+    rig.live(4)
+    assert rig.keeper.prism_suspicions() == []
+    assert set(used(rig)) == {8000}
+    assert len(used(rig)) - before > 50
