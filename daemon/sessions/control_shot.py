@@ -40,12 +40,18 @@ class Shot:
     places_mm: list[Place] = field(default_factory=list)
     done: Future[None] = field(default_factory=Future)
 
-    def take(self, fix: Fix, order: Order) -> None:
-        """Add a fix, in order of time, if it is of the point; the last fix needed completes the shot."""
+    def take(self, fix: Fix, measured: Stamp, order: Order) -> None:
+        """Add a fix, in order of time, if it is of the point; the last fix needed completes the shot.
+
+        Args:
+            fix: the fix.
+            measured: when it was measured, which is before it arrived.
+            order: order of instants.
+        """
         place_mm = position_mm(fix)
         if self.done.done() or place_mm is None or fix.status is not Status.OK:
             return
-        if not lies_within(order, fix.stamp, self.aimed, None):
+        if not lies_within(order, measured, self.aimed, None):
             return
         if self.places_mm and math.dist(place_mm, self.places_mm[0]) > SPREAD_MM:
             self.fixes.clear()  # the station was still turning to the point

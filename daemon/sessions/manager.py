@@ -93,7 +93,7 @@ class SessionManager:
     ) -> None:
         self._rig, self._rig_text = rig, rig_text
         self._store, self._joiner, self._settings, self._clock = store, joiner, settings, clock
-        self._setups, self._are_jobs_enabled = setups, are_jobs_enabled
+        self._setups, self._are_jobs_enabled, self._measured = setups, are_jobs_enabled, joiner.measured
         self._lifecycle = SessionLifecycle(store, rig, clock, settings.control_tolerance_mm, clock_state)
         self._table, self._observations = self._lifecycle.table, ObservationTable(store)
         self._jobs = JobTable(store, rig.name)
@@ -120,7 +120,7 @@ class SessionManager:
         for record in records:
             if isinstance(record, Fix):
                 if (shot := self._shot) is not None:  # a shot names its fixes, which must be stored before
-                    self.pending.once_stored(partial(shot.take, record, self._store.order))
+                    self.pending.once_stored(partial(shot.take, record, self._measured(record), self._store.order))
                 self._watch_prism(record)
             elif isinstance(record, DeviceEvent) and record.kind is EventKind.PRESET_JUMP:
                 for session in self._taking():
@@ -139,7 +139,7 @@ class SessionManager:
 
     def is_of_session(self, record: Reading | Fix) -> bool:
         """Return True if a record was measured in the open session, or in an ended one that may still get fixes."""
-        at = self._joiner.measured(record) if isinstance(record, Fix) else record.stamp
+        at = self._measured(record) if isinstance(record, Fix) else record.stamp
         return any(session.lasted(at) for session in self._taking())
 
     def _judge_again(self, records: Sequence[Record]) -> None:
@@ -149,7 +149,7 @@ class SessionManager:
         """
         fixes = [record for record in records if isinstance(record, Fix)]
         for session in [session for session in self._taking() if session.is_outdated]:
-            first = next((fix.stamp for fix in fixes if session.lasted(self._joiner.measured(fix))), None)
+            first = next((fix.stamp for fix in fixes if session.lasted(self._measured(fix))), None)
             if first is None:
                 continue
             try:
@@ -161,7 +161,7 @@ class SessionManager:
 
     def _watch_prism(self, fix: Fix) -> None:
         for session in self._taking():
-            if session.lasted(self._joiner.measured(fix)):
+            if session.lasted(self._measured(fix)):
                 self._prisms.see(session, fix)
 
     def _taking(self) -> list[OpenSession]:

@@ -190,7 +190,7 @@ class ObservationMaker:
         if session.kind in STANDING_KINDS and joined.standstill is None:
             self._prisms.note_moving(session, joined)
             # A suspicion is stored: a restart before the boom stands must not end it, and it is no fix of the prism
-            return self._prisms.doubt(session, joined.fix) or MOVING
+            return self._prisms.doubt(session, joined) or MOVING
         return None
 
     def _why_another_prism(
@@ -200,9 +200,9 @@ class ObservationMaker:
         changed = self._prisms.ask_joints(session, joined, place_mm)
         if changed:
             changed |= self._places.withdraw([at_ns for at_ns, why in changed.items() if why is not None])
-        excluded = self._prisms.doubt(session, joined.fix)
+        excluded = self._prisms.doubt(session, joined)
         if excluded is None and standstill is not None:
-            at_ns, confirmed = joined.stamp.monotonic_ns, session.confirmations_by(joined.fix.stamp)
+            at_ns, confirmed = joined.stamp.monotonic_ns, session.confirmations_by(joined.stamp)
             here = self._places.add(standstill, at_ns, place_mm, joined.values, confirmed)
             excluded = here.pop(at_ns)
             changed |= here

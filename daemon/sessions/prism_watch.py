@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -130,12 +131,12 @@ class PrismWatch:
         if (followed := _followed(session, joined)) is None:
             return
         guard, evidence, turn = followed
-        is_suspected = guard.doubt(joined.fix.stamp) is not None
+        is_suspected = guard.doubt(joined.stamp) is not None
         jump_m = evidence.jump_m(joined, place_mm, turn, is_suspected=is_suspected)
         if jump_m is None:
             return
-        is_told = guard.may_turn(joined.fix.stamp)
-        turn = guard.part(joined.fix.stamp)
+        is_told = guard.may_turn(joined.stamp)
+        turn = guard.part(joined.stamp)
         if is_told:
             return
         text = _moved_otherwise(jump_m, session.prism)
@@ -150,7 +151,7 @@ class PrismWatch:
         confirmed the prism, because the lock may have been lost just afterwards.
         """
         guard, station = session.guards[joined.fix.station], joined.fix.station
-        if guard.doubt(joined.fix.stamp) is not None or session.evidence is None:
+        if guard.doubt(joined.stamp) is not None or session.evidence is None:
             return {}
         stray_m = session.evidence.stray_m(station)
         if stray_m is None:
@@ -187,10 +188,10 @@ class PrismWatch:
         log.warning("station %s: %s", event.device, event.text)
         self._keep(event)
 
-    def doubt(self, session: OpenSession, fix: Fix) -> str | None:
+    def doubt(self, session: OpenSession, joined: JoinedFix) -> str | None:
         """Return why a fix given to `see` must not be used; None if it may."""
-        guard = session.guards.get(fix.station)
-        suspicion = guard.doubt(fix.stamp) if guard is not None else None
+        guard = session.guards.get(joined.fix.station)
+        suspicion = guard.doubt(joined.stamp) if guard is not None else None
         return suspicion.reason if suspicion is not None else None
 
     def suspicions(self, session: OpenSession) -> list[Suspicion]:
@@ -245,16 +246,17 @@ class PrismWatch:
 
         Args:
             session: the session, of which more has become known; left as it is if the store cannot be read.
-            until: fixes from this instant on are left out, because they are still to be given to `see`.
+            until: fixes that arrived from this instant on are left out, because they are still to be given to `see`.
         """
         evidence, guards = self._evidence(session), dict[str, PrismGuard]()
         with self._store.reader() as reader:
             for station in self._limits:
                 guard = guards[station] = self._new_guard(session, station)
                 for row in fixes_since_used(reader, session.id, station):
-                    fix = _fix(station, row, reader.stamp(row))
-                    if until is not None and lies_within(session.order, fix.stamp, until, None):
+                    arrived = reader.stamp(row)
+                    if until is not None and lies_within(session.order, arrived, until, None):
                         break
+                    fix = self._as_measured(_fix(station, row, arrived))
                     if self._is_of_target(session, fix):
                         guard.see(fix)
                         guard.suspect_again(fix.stamp, row["excluded"] or "")
@@ -267,15 +269,20 @@ class PrismWatch:
 
     def _take(self, session: OpenSession, fix: Fix) -> DeviceEvent | None:
         guard = self._guard(session, fix.station)
-        if self._is_of_target(session, fix):
-            return guard.see(fix)
+        measured = self._as_measured(fix)
+        if self._is_of_target(session, measured):
+            return guard.see(measured)
         guard.look_away()
         return None
 
+    def _as_measured(self, fix: Fix) -> Fix:
+        """Return a fix stamped with when it was measured, which is what confirmations and shots are compared with."""
+        return replace(fix, stamp=self._measured(fix))
+
     def _is_of_target(self, session: OpenSession, fix: Fix) -> bool:
-        """Return False for a fix that is known to be of a control point."""
+        """Return False for a fix, stamped as measured, that is known to be of a control point."""
         place_mm = position_mm(fix)
-        return session.has(self._measured(fix)) and not (place_mm is not None and session.is_control_point(place_mm))
+        return session.has(fix.stamp) and not (place_mm is not None and session.is_control_point(place_mm))
 
     def _guard(self, session: OpenSession, station: str) -> PrismGuard:
         if station not in session.guards:
@@ -290,7 +297,7 @@ class PrismWatch:
 def _followed(session: OpenSession, joined: JoinedFix) -> tuple[PrismGuard, PrismEvidence, Turn] | None:
     """Return guard, evidence and turn of the target that a fix given to `see` is of; None if nothing is known of it."""
     guard, evidence = session.guards.get(joined.fix.station), session.evidence
-    turn = None if guard is None else guard.turn(joined.fix.stamp)
+    turn = None if guard is None else guard.turn(joined.stamp)
     return None if guard is None or evidence is None or turn is None else (guard, evidence, turn)
 
 

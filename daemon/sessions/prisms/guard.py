@@ -145,8 +145,9 @@ class PrismGuard:
     shots a prism can move far, and only faster motion is suspected. Positions from circles and from the instrument's
     own coordinates have different origins and are never compared. The first fix after a confirmation is believed.
 
-    Stamps give when fixes were read. After a fix that was read late, the next one appears too soon. Therefore two
-    successive fixes are assumed to be at least the usual interval apart.
+    Fixes are stamped with when they were measured: when they were read, less the link delay. After a fix that was read
+    late, the next one appears too soon. Therefore two successive fixes are assumed to be at least the usual interval
+    apart.
 
     Attributes:
         station: name of the station.
@@ -258,7 +259,7 @@ class PrismGuard:
         self._is_new_lock = True
 
     def see(self, fix: Fix) -> DeviceEvent | None:
-        """Add a fix, in order, and return an event for the operator if there is one."""
+        """Add a fix, in order, stamped with when it was measured; return an event for the operator if there is one."""
         while self._heeded < len(self.confirmations) and self.order(fix.stamp) >= self.order(
             self.confirmations[self._heeded].at
         ):
