@@ -158,13 +158,13 @@ def _between_sessions(status: Mapping[str, Any]) -> NextStep:
     if candidate is not None:
         what = f"Model {candidate['id']} waits"
     elif live is None:
-        what = "No model is live yet"
+        what = "No model is live"
     elif is_drifting:
         what = f"Model {live['id']} is live, but check shots show drift from it"
     else:
         what, tone = f"Ready: model {live['id']} is live", "good"
     pressing = next(_pressing(status, candidate), None)
-    step, how = pressing or _to_improve(live, candidate, is_drifting=is_drifting)
+    step, how = pressing or _to_improve(models, is_drifting=is_drifting)
     button = "Start a guided session"
     return NextStep(what, tone, step, how, button, screen="guide", is_pressing=pressing is not None)
 
@@ -187,20 +187,27 @@ def _pressing(status: Mapping[str, Any], candidate: Mapping[str, Any] | None) ->
         yield f"measure what distinguishes the possible causes: {verdict['experiments'][0]}", ""
 
 
-def _to_improve(
-    live: Mapping[str, Any] | None, candidate: Mapping[str, Any] | None, *, is_drifting: bool
-) -> tuple[str, str]:
+def _to_improve(models: Mapping[str, Any], *, is_drifting: bool) -> tuple[str, str]:
     """Return the step that leads to a first or a better model, and the command for it."""
+    live, candidate, earlier = models.get("live"), models.get("candidate"), models.get("to_put_back")
     if candidate is not None:
-        refused = f"model {candidate['id']} would be refused: {candidate['refused_because']}"
-        if candidate.get("is_outdated"):
-            return f"{refused}; hold a calibration session, which yields a new model", _NEW_SESSION
-        if candidate["comparison"].get("is_stale"):
-            return refused, ""  # the reason says how it is compared again
-        return f"{refused}; hold sessions with other prisms or poses, then another check session", ""
+        return _to_replace(candidate)
+    if live is None and earlier is not None:
+        step = f"put model {earlier} back, which was live before, or hold a calibration session"
+        return step, f"`rigcal model rollback {earlier}`; {_NEW_SESSION}"
     if live is None:
         step = "hold a calibration session; a guided session covers all prisms and a check, and yields a first model"
         return step, f"{_NEW_SESSION}; `rigcal plan` proposes poses"
     if is_drifting:
         return "the machine has changed: measure it again", _NEW_SESSION
     return "nothing to do; an occasional check session shows whether the live model is still accurate", ""
+
+
+def _to_replace(candidate: Mapping[str, Any]) -> tuple[str, str]:
+    """Return the step that leads to a better model than a candidate that would be refused, and the command for it."""
+    refused = f"model {candidate['id']} would be refused: {candidate['refused_because']}"
+    if candidate.get("is_outdated"):
+        return f"{refused}; hold a calibration session, which yields a new model", _NEW_SESSION
+    if candidate["comparison"].get("is_stale"):
+        return refused, ""  # the reason says how it is compared again
+    return f"{refused}; hold sessions with other prisms or poses, then another check session", ""

@@ -389,7 +389,8 @@ class JobQueue:
         run = self._models.live_run()
         through = closed[-1]["id"]
         job_id = self._add(JobKind.COMPARISON, checks[-1], through, model_id=model.id, live_since=self._live_since(run))
-        return f"job {job_id} will compare model {model.id} with the live one"
+        other = "the live one" if run else "its nominal stage, as no model is live"
+        return f"job {job_id} will compare model {model.id} with {other}"
 
     def compare_again(self, model_id: int) -> str:
         """Queue a comparison of the model with this number, as `compare` does."""

@@ -17,7 +17,7 @@ from typing import Any
 from calibration.errors import CalibrationError, ModelError, UnsafeError
 from daemon.commands import REFUSED, CommandError, caller_columns, text_argument
 from daemon.models.live_model import LiveModel
-from daemon.store.queries.models import ModelRow, ModelTable
+from daemon.store.queries.models import REJECTED, ModelRow, ModelTable
 
 log = logging.getLogger(__name__)
 
@@ -94,14 +94,16 @@ class ModelRegistry:
         if not reason:
             raise CommandError(f"give a reason for rejecting model {model.id}; it is stored with the model")
         operator = text_argument(arguments, "operator")
-        if not self._table.reject(model, f"rejected: {reason}", operator=operator, **caller_columns()):
+        if not self._table.reject(model, f"{REJECTED}{reason}", operator=operator, **caller_columns()):
             state = self._table.get(model.id).state
             raise CommandError(f"model {model.id} is {state}; only a candidate or the live model can be rejected")
         log.warning("model %d was rejected by %s: %s", model.id, operator or "an unnamed operator", reason)
         if model.state == "candidate":
             return f"model {model.id} is rejected"
         self._live.changed()
-        return f"model {model.id} is rejected; no model is live now, and there is no corrected position"
+        told = f"model {model.id} is rejected; no model is live now, and there is no corrected position"
+        good = self._to_put_back()
+        return told if good is None else f"{told}; `rigcal model rollback {good}` puts model {good} back"
 
     def rollback_command(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
         """Make the predecessor of the live model live again, or any other model that was live before."""
@@ -110,10 +112,8 @@ class ModelRegistry:
         if wanted is None:
             wanted = None if live is None else self._table.predecessor(live)
             if wanted is None:
-                others = [m.id for m in self._table.all() if m.state == "retired" and self._table.was_live(m)]
-                instead = f"name one, as `rigcal model rollback {others[-1]}`" if others else "accept a better model"
-                why = f"model {live.id} was the first to go live and has no predecessor" if live else "no model is live"
-                raise CommandError(f"{why}; {instead}")
+                none = f"model {live.id} replaced no other one when it went live" if live else "no model is live"
+                raise CommandError(f"{none}; {self._instead()}")
         model = self._own(self._table.get(wanted))
         if model.state != "retired" or not self._table.was_live(model):
             why = {
@@ -122,8 +122,11 @@ class ModelRegistry:
                 "retired": "was rejected and never live",
             }[model.state]
             raise CommandError(f"model {model.id} {why}")
+        doubts = [] if (rejection := self._table.rejection(model)) is None else [f"it had been {rejection}"]
+        if (unused := self._table.not_used(model.sessions)) is not None:
+            doubts.append(f"it was trained on {_not_used(*unused)}")
         self._make_live(model, live, arguments, "put back")
-        return self._changed(model, live)
+        return self._changed(model, live) | ({"reason": f"note that {'; '.join(doubts)}"} if doubts else {})
 
     def zeros_checked_command(self, arguments: Mapping[str, Any]) -> str:
         """Record the operator's confirmation that the joints' zeros are those that a model was trained with.
@@ -147,9 +150,13 @@ class ModelRegistry:
         return f"model {model.id} is in use again; {told}" if model.state == "live" else f"model {model.id}: {told}"
 
     def status(self) -> dict[str, Any]:
-        """Return the live model and the newest candidate, for `status`."""
+        """Return the live model, the newest candidate and, without a live model, the one to put back, for `status`."""
         live, waiting = self._table.live(), self._table.waiting()
-        return {"live": live and self._brief(live, live), "candidate": waiting and self._candidate(waiting, live)}
+        return {
+            "live": live and self._brief(live, live),
+            "candidate": waiting and self._candidate(waiting, live),
+            "to_put_back": self._to_put_back() if live is None else None,
+        }
 
     def _candidate(self, model: ModelRow, live: ModelRow | None) -> dict[str, Any]:
         """Return a candidate, with whether `accept_command` would accept it now and, if not, the reason.
@@ -167,6 +174,27 @@ class ModelRegistry:
         return self._brief(model, live) | told | {"is_outdated": self._table.not_used(model.sessions) is not None}
 
     # ---- parts -------------------------------------------------------------------------------------------------------
+
+    def _formerly_live(self) -> list[ModelRow]:
+        """Return the rig's retired models that were live, the newest first."""
+        models = [model for model in self._table.all() if model.rig == self._rig and model.state == "retired"]
+        return [model for model in reversed(models) if self._table.was_live(model)]
+
+    def _to_put_back(self) -> int | None:
+        """Return the newest model that was live and is neither rejected nor of a session that is; None without one."""
+        good = (
+            m for m in self._formerly_live() if not self._table.rejection(m) and not self._table.not_used(m.sessions)
+        )
+        return next((model.id for model in good), None)
+
+    def _instead(self) -> str:
+        """Return what to do where there is no predecessor to roll back to."""
+        if (good := self._to_put_back()) is not None:
+            return f"name one, as `rigcal model rollback {good}`"
+        if others := self._formerly_live():
+            why = self._table.rejection(others[0]) or "trained on a session that is not used any more"
+            return f"accept a better model, or name one: model {others[0].id} was live, but is {why}"
+        return "accept a better model"
 
     def _wanted(self, arguments: Mapping[str, Any]) -> ModelRow:
         if arguments.get("id") is not None:
@@ -221,7 +249,7 @@ class ModelRegistry:
             raise CommandError(f"{_CANNOT.format(model.id)}it was trained on {_not_used(*unused)}", REFUSED)
         compared = model.comparison
         stale = None if compared is None else self._why_stale(compared, live)
-        again = f"; `rigcal model compare {model.id}` compares it again"
+        again = f"; `rigcal model compare {model.id}` compares it{'' if compared is None else ' again'}"
         if (compared is None or stale) and (job := self._comparison_job(model)) is not None:
             again = f"; wait for job {job}, which will compare it"
         elif compared is None and (later := self._comparison_after(model)) is not None:

@@ -24,7 +24,6 @@ from drivers.stations.replies import Reply
 from drivers.stations.survey import position_mm, range_checked
 
 _UNFINISHED_NS = 2 * NS_PER_S  # an unfinished record is discarded after this, even if no more bytes arrive
-_PAUSE_NS = NS_PER_S // 2  # a record has no longer pause, and no one plugs an adapter in more quickly
 
 Point = tuple[float, float, float]
 
@@ -35,9 +34,6 @@ class StationDecoder:
     A fix is stamped with the arrival of its first byte; if that time is doubtful, the fix may not be used. Transmitted
     captures give no records. Records caused by the passing of time are stamped with the instant at which they were due,
     so they do not depend on how often `tick` is called.
-
-    Bytes that arrive after a pause do not complete a record that was begun before it: the adapter may have been
-    unplugged in between, and the halves of two records may look like one.
 
     Args:
         config: configuration of the station, the same as its link's.
@@ -55,9 +51,6 @@ class StationDecoder:
             return []
         records = self.tick(capture.stamp)
         if not capture.is_transmitted:
-            if self._last_byte is not None and capture.stamp.since(self._last_byte) > _PAUSE_NS:
-                for reply in self._reader.flush("incomplete record"):
-                    records += reply.records
             self._last_byte = capture.stamp
         for reply in self._reader.feed(capture):
             records += self._records(reply)

@@ -40,7 +40,7 @@ def guide(**step: Any) -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("now", "state", "button"),
     [
-        (status(), "No model is live yet", "Start a guided session"),
+        (status(), "No model is live", "Start a guided session"),
         (status(models={"live": LIVE, "candidate": None}), "Ready: model 4 is live", "Start a guided session"),
         (
             status(models={"live": LIVE, "candidate": None}, gap={"drift": {"alarm": "worse"}}),
@@ -118,3 +118,9 @@ def test_a_session_in_which_an_encoder_jumped_is_not_to_be_continued() -> None:
 def test_a_step_of_a_session_is_a_sentence_with_what_is_left_to_do() -> None:
     step = next_for_page(status(session=SESSION))["step"]
     assert step == "Stand still at 22 more poses, spread over the ranges of all joints."
+
+
+def test_without_a_live_model_the_one_that_was_live_before_is_named() -> None:
+    line = next_line(status(models={"live": None, "candidate": None, "to_put_back": 3}))
+    assert "put model 3 back" in line
+    assert "`rigcal model rollback 3`" in line

@@ -43,8 +43,13 @@ def certificates(system: System, model: Model, places: Sequence[set[str]], seed:
 
 
 def _f_test(system: System, model: Model, effect: Chosen) -> float:
-    """Return the p-value of adding an effect to a model, for rows that were not used to select it."""
+    """Return the p-value of adding an effect to a model, for rows that were not used to select it.
+
+    It is 1 if these rows cannot show the effect, as where all of them were measured after a jump.
+    """
     squares, columns, total = system.explained(model, effect)
+    if columns == 0:
+        return 1.0
     rest = system.products.rows - columns
     return float(fdtrc(columns, rest, (squares / columns) / ((total - squares) / rest)))
 

@@ -23,6 +23,7 @@ from daemon.store.queries.zeros import Zeros
 from daemon.store.rows import marks
 from drivers.clock import Clock
 
+REJECTED = "rejected: "
 _MODELS = """SELECT model.id, model.rig, model.path, model.manifest_sha256, model.stage, model.state,
         model.metrics_json, model.created_utc_ns, job.result_json
     FROM models AS model LEFT JOIN jobs AS job ON job.id = model.job_id"""
@@ -295,6 +296,12 @@ class ModelTable:
     def was_live(self, model: ModelRow) -> bool:
         """Return True if a model was ever live."""
         return any(change["state"] == "live" for change in self.history(model))
+
+    def rejection(self, model: ModelRow) -> str | None:
+        """Return the reason with which an operator rejected a model that is retired for it; None if that is not so."""
+        retired = [change for change in self.history(model) if change["state"] in ("live", "retired")]
+        reason = str(retired[-1]["reason"]) if retired else ""
+        return reason if model.state == "retired" and reason.startswith(REJECTED) else None
 
     def at_once(self) -> AbstractContextManager[object]:
         """Return a transaction: all changes in its block are stored together, or none."""

@@ -64,7 +64,9 @@ def test_a_candidate_is_compared_on_check_sessions_then_accepted_and_loaded(rig:
     measured(rig, "a", 5)
     measured(rig, "c", 4, "check")
     model = rig.candidate()
-    assert rig.registry.compare_command({"id": model}) == f"job 2 will compare model {model} with the live one"
+    assert rig.registry.compare_command({"id": model}) == (
+        f"job 2 will compare model {model} with its nominal stage, as no model is live"
+    )
     assert "wait for job 2, which will compare it" in refusal(rig.registry.accept_command, REFUSED, id=model)
     compared = rig.compare()
     assert compared["against"] == "nominal"
@@ -273,7 +275,7 @@ def test_nothing_is_named_where_no_other_model_was_ever_live(rig: ModelRig) -> N
     live = rig.accepted(30)
     rig.candidate()
     told = refusal(rig.registry.rollback_command, WRONG_USE)
-    assert told == f"model {live} was the first to go live and has no predecessor; accept a better model"
+    assert told == f"model {live} replaced no other one when it went live; accept a better model"
 
 
 def test_rollback_puts_back_what_the_live_model_replaced_step_by_step(rig: ModelRig) -> None:
@@ -282,7 +284,7 @@ def test_rollback_puts_back_what_the_live_model_replaced_step_by_step(rig: Model
     assert rig.registry.rollback_command({})["live"] == one
     assert states(rig) == {one: "live", two: "retired", three: "retired"}
     told = refusal(rig.registry.rollback_command, WRONG_USE)
-    assert f"the first to go live and has no predecessor; name one, as `rigcal model rollback {three}`" in told
+    assert f"replaced no other one when it went live; name one, as `rigcal model rollback {three}`" in told
     assert rig.registry.rollback_command({"id": three})["retired"] == one
     assert rig.registry.rollback_command({})["live"] == two, "what the third had replaced when it was accepted"
     loaded = rig.settled()
@@ -567,5 +569,17 @@ def test_a_live_model_that_is_rejected_is_out_of_use_at_once_and_can_be_put_back
     assert isinstance(rig.live.now(), Missing)
     assert rig.settled() == Missing(NO_MODEL)
     assert rig.registry.status()["live"] is None
-    assert f"`rigcal model rollback {live}`" in refusal(rig.registry.rollback_command, WRONG_USE)
-    assert rig.registry.rollback_command({"id": live, "operator": "Ada"})["live"] == live
+    told = refusal(rig.registry.rollback_command, WRONG_USE)
+    assert told.endswith(f"name one: model {live} was live, but is rejected: trained on w")
+    back = rig.registry.rollback_command({"id": live, "operator": "Ada"})
+    assert (back["live"], back["reason"]) == (live, "note that it had been rejected: trained on w")
+
+
+def test_of_the_models_that_were_live_one_that_is_not_rejected_is_named_to_be_put_back(rig: ModelRig) -> None:
+    one, two = rig.accepted(30), rig.accepted(40)
+    told = rig.registry.reject_command({"id": two, "reason": "trained on w"})
+    assert told.endswith(f"`rigcal model rollback {one}` puts model {one} back")
+    assert f"as `rigcal model rollback {one}`" in refusal(rig.registry.rollback_command, WRONG_USE)
+    assert rig.registry.status()["to_put_back"] == one
+    assert rig.registry.rollback_command({"id": one})["live"] == one
+    assert rig.registry.status()["to_put_back"] is None

@@ -192,17 +192,6 @@ def test_an_unfinished_record_is_given_up_two_seconds_after_its_last_byte() -> N
     assert failures(station.tick(at(3.2))) == []
 
 
-def test_halves_of_two_records_are_no_fix() -> None:
-    station = decoder(profile="passive", listen_to="sokkia")
-    first, second = b"0012345 0900000 0100000\r\n", b"0019999 0900000 0203000\r\n"
-    assert station.feed(received(first[:12], 1.0)) == []
-    records = station.feed(received(second[12:], 1.6))  # as soon as an adapter can be plugged in again
-    assert fixes(records) == []
-    assert failures(records)[0] == ("incomplete record", first[:12])
-    (fix,) = fixes(station.feed(received(second, 1.8)))
-    assert fix.slope_distance_m == 19.999
-
-
 def test_a_record_amid_which_the_computer_does_not_run_for_a_moment_is_a_fix() -> None:
     station = decoder(profile="passive", listen_to="sokkia")
     record = b"0012345 0900000 0100000\r\n"

@@ -11,7 +11,7 @@ import pytest
 
 from drivers.clock import NS_PER_S, ScaledClock, SystemClock
 from drivers.outage import BACKOFF_MAX_S
-from drivers.readings import DecodeFailure, DeviceEvent, EventKind, Fix, Gap, GapReason, LinkItem, SerialCapture, Status
+from drivers.readings import DeviceEvent, EventKind, Fix, Gap, GapReason, LinkItem, SerialCapture, Status
 from drivers.stations.config import StationConfig
 from drivers.stations.decoder import StationDecoder
 from drivers.stations.link import StationLink
@@ -137,24 +137,6 @@ def test_the_link_survives_unplugging_and_plugging_in_again(tmp_path: Path) -> N
         assert (closed.reason, closed.start) == (GapReason.LINK_DOWN, opened.start)
         assert closed.end is not None
         assert closed.end.monotonic_ns > closed.start.monotonic_ns
-
-
-def test_a_record_cut_by_unplugging_is_not_completed_by_what_comes_after_plugging_in(tmp_path: Path) -> None:
-    passive = config(tmp_path / "tty", profile="passive", listen_to="sokkia")
-    first, second = b"0012345 0900000 0100000\r\n", b"0019999 0900000 0203000\r\n"
-    with plugged_in(tmp_path / "tty") as instrument, running(passive) as collected:
-        collected.wait_for_event(EventKind.LINK_UP)
-        instrument.send(first[:12])
-        collected.wait_for_bytes(12)
-        instrument.unplug()
-        time.sleep(0.6)
-        instrument.plug_in()
-        collected.wait_for_event(EventKind.LINK_UP, 2)
-        instrument.send(second[12:])
-        collected.wait_for_bytes(len(second))
-    decoder = StationDecoder(passive)
-    records = [record for capture in collected.captures() for record in decoder.feed(capture)]
-    assert [type(record) for record in records] == [DecodeFailure, DecodeFailure]
 
 
 def test_a_station_that_is_plugged_in_after_the_start_is_found(tmp_path: Path) -> None:
