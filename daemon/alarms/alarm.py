@@ -10,8 +10,8 @@ from daemon.host.safe_output import shown
 from daemon.monitoring.notice import Severity
 from drivers.clock import Stamp
 
-# Subject and text of a fault, and its severity and remedy where these differ from the rule's usual ones.
-Finding = tuple[str, str] | tuple[str, str, Severity] | tuple[str, str, Severity, str]
+# Subject and text of a fault, and its severity and remedy where these differ from the rule's usual ones (None: usual).
+Finding = tuple[str, str] | tuple[str, str, Severity] | tuple[str, str, Severity | None, str]
 
 TEXT_MAX = 300  # an instrument may send any text of any length, control characters included
 
@@ -82,8 +82,8 @@ class Rule:
             return
         for finding in self.find(evidence):
             subject, text = finding[:2]
-            severity = self.severity if len(finding) == 2 else finding[2]
-            remedy = finding[3] if len(finding) == 4 else self.remedy
+            severity = (finding[2] if len(finding) > 2 else None) or self.severity
+            remedy = finding[3] if len(finding) > 3 else self.remedy
             plain = _cut(shown(text).removeprefix(f"{subject}: "))  # shown after the subject
             yield Alarm(self.kind, subject, severity, plain, remedy.replace("SUBJECT", subject))
 

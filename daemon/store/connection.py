@@ -94,9 +94,8 @@ class Connection:
         connection.execute("PRAGMA synchronous = FULL")
         connection.execute("PRAGMA foreign_keys = ON")
         connection.execute("PRAGMA secure_delete = OFF")  # Debian's default: pages that are freed are written once more
-        connection.execute(
-            f"PRAGMA journal_size_limit = {KEPT_BYTES}"
-        )  # a log grown behind a slow reader shrinks again
+        # A log that has grown behind a slow reader shrinks again
+        connection.execute(f"PRAGMA journal_size_limit = {KEPT_BYTES}")
         if later := unknown_migrations(self._db):
             raise StoreError(f"{self.path}: made by a newer rigcal (it has {later[0]}); install that version")
         if pending_migrations(self._db):

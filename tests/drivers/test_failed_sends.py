@@ -127,10 +127,8 @@ def test_an_slcan_adapter_that_accepts_nothing_is_still_read(adapter: Adapter) -
     assert heard.events(EventKind.LINK_LOST) == []
 
 
-def test_an_slcan_adapter_that_accepts_lines_only_in_part_gets_their_ends_before_the_next_line(
-    adapter: Adapter,
-) -> None:
-    port = open_port(
+def sending_port(adapter: Adapter) -> CanPort:
+    return open_port(
         CanLinkConfig(
             name="boom",
             interface="slcan",
@@ -139,6 +137,12 @@ def test_an_slcan_adapter_that_accepts_lines_only_in_part_gets_their_ends_before
             options={"sleep_after_open": 0},
         )
     )
+
+
+def test_an_slcan_adapter_that_accepts_lines_only_in_part_gets_their_ends_before_the_next_line(
+    adapter: Adapter,
+) -> None:
+    port = sending_port(adapter)
     try:
         sent = 0
         while port.send(Frame(0x6A0, b"\x01\x02")):
@@ -158,15 +162,7 @@ def test_frames_that_an_slcan_adapter_does_not_take_are_discarded_and_not_sent_w
     # The kernel counts the bytes that a real adapter has not taken; it counts none for a pseudo-terminal
     untaken = 0
     monkeypatch.setattr(serial.Serial, "out_waiting", property(lambda _port: untaken))
-    port = open_port(
-        CanLinkConfig(
-            name="boom",
-            interface="slcan",
-            channel=str(adapter.path),
-            allow_transmit=True,
-            options={"sleep_after_open": 0},
-        )
-    )
+    port = sending_port(adapter)
     try:
         deadline_s = time.monotonic() + DEADLINE_S
         assert port.send(Frame(0x680, b"\x01"))

@@ -9,7 +9,6 @@ from daemon.acquisition.status.silence import START_NODES
 from daemon.acquisition.status.snapshot import ChannelStatus
 from daemon.alarms.alarm import Finding, rule
 from daemon.alarms.evidence import Evidence
-from daemon.monitoring.notice import Severity
 from drivers.readings import EventKind, Status
 
 START_S = 5.0  # time that devices need to start after their link was opened
@@ -55,7 +54,7 @@ def joint_silent(evidence: Evidence) -> Iterator[Finding]:
     If its node has booted since the last reading, or still sends its heartbeat, the alarm says so and asks to start the
     node instead. Cleared when readings have arrived again for 3 s.
     """
-    yield from _silent(evidence, "joint", "critical")
+    yield from _silent(evidence, "joint")
 
 
 @rule(
@@ -70,7 +69,7 @@ def signal_silent(evidence: Evidence) -> Iterator[Finding]:
 
     Raised and cleared as for joints.
     """
-    yield from _silent(evidence, "signal", "warning")
+    yield from _silent(evidence, "signal")
 
 
 @rule(
@@ -127,7 +126,7 @@ def _has_started(evidence: Evidence, channel: ChannelStatus) -> bool:
     return link is None or link.since_s - (evidence.acquisition.decoded_age_s or 0.0) >= START_S
 
 
-def _silent(evidence: Evidence, kind: str, severity: Severity) -> Iterator[Finding]:
+def _silent(evidence: Evidence, kind: str) -> Iterator[Finding]:
     for link, channels in _by_link(evidence).items():
         if _is_quiet(evidence, link, channels):
             continue
@@ -136,7 +135,7 @@ def _silent(evidence: Evidence, kind: str, severity: Severity) -> Iterator[Findi
                 is_new = channel.last_status is None
                 text = "not received since the start" if is_new else f"no longer received (last: {channel.last_status})"
                 if channel.silence:
-                    yield channel.name, f"{channel.name} is {text}: {channel.silence}", severity, START_NODES
+                    yield channel.name, f"{channel.name} is {text}: {channel.silence}", None, START_NODES
                 else:
                     yield channel.name, f"{channel.name} is {text}"
 

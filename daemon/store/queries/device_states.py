@@ -20,12 +20,12 @@ STATES = (
     EventKind.HEARTBEAT_RESTORED,
     EventKind.WARNING,
 )
-# Goes from one device to the next by the index, however many events each device has.
-_DEVICES = """WITH RECURSIVE named(device) AS (
+# `named`, the devices: goes from one to the next by the index, however many events each has. The last row is NULL.
+NAMED = """WITH RECURSIVE named(device) AS (
         SELECT min(device) FROM device_events
         UNION ALL SELECT (SELECT min(device) FROM device_events WHERE device > named.device)
-            FROM named WHERE named.device IS NOT NULL)
-    SELECT device FROM named WHERE device IS NOT NULL"""
+            FROM named WHERE named.device IS NOT NULL)"""
+_DEVICES = f"{NAMED} SELECT device FROM named WHERE device IS NOT NULL"
 _LAST = """SELECT id, utc_ns, monotonic_ns, boot_id, device, kind, text, code FROM device_events
     WHERE device = ? AND kind = ? AND boot_id = ? AND monotonic_ns < ? AND {}
     ORDER BY monotonic_ns DESC, id DESC LIMIT 1"""

@@ -11,18 +11,16 @@ from functools import cached_property
 from typing import Any
 
 from daemon.store.connection import Connection
+from daemon.store.queries.device_states import NAMED
 from drivers.clock import Stamp
 
 # The number of the boot increases from boot to boot, and monotonic_ns within a boot; utc_ns may step. A faulty encoder
 # may jump at every frame: the index leads from one device to the next, and to the one jump of each that is read.
-_JUMPS = """WITH RECURSIVE named(device) AS (
-        SELECT min(device) FROM device_events
-        UNION ALL SELECT (SELECT min(device) FROM device_events WHERE device > named.device)
-            FROM named WHERE named.device IS NOT NULL)
+_JUMPS = f"""{NAMED}
     SELECT jump.id, jump.device, jump.utc_ns, jump.monotonic_ns, jump.boot_id
     FROM named CROSS JOIN device_events AS jump ON jump.id = (SELECT id FROM device_events AS own
         WHERE own.device = named.device AND kind = 'preset_jump' AND (boot_id, monotonic_ns) >= (?, ?)
-        ORDER BY boot_id {0}, monotonic_ns {0}, id {0} LIMIT 1)
+        ORDER BY boot_id {{0}}, monotonic_ns {{0}}, id {{0}} LIMIT 1)
     ORDER BY jump.device"""
 _LAST = """SELECT boot_id, monotonic_ns, id FROM device_events
     WHERE device = ? AND kind = 'preset_jump' AND (boot_id, monotonic_ns) < (?, ?) AND id <= ?

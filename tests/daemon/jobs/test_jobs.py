@@ -18,6 +18,7 @@ from daemon.store.errors import NotInStoreError
 from daemon.store.migrations import MIGRATIONS
 from drivers.clock import NS_PER_S, Stamp
 from tests.daemon.support.jobs import JobRig, is_gone
+from tests.daemon.support.store import steps_of
 
 
 def table(rig: JobRig) -> JobQueue:
@@ -371,20 +372,15 @@ def test_looking_for_work_stays_cheap_after_years(rig: JobRig) -> None:
     jobs = JobQueue(rig.store, "swdt82", rig.clock)
     jobs.state()
     statements: list[str] = []
-    steps = 0
 
-    def count() -> int:
-        nonlocal steps
-        steps += 100
-        return 0
+    def look() -> None:
+        jobs.state()
+        jobs.table.unfinished()
 
     with rig.store.transaction() as db:
         db.conn.set_trace_callback(statements.append)
-        db.conn.set_progress_handler(count, 100)  # of SQLite's virtual machine; unlike time it is always the same
-        jobs.state()
-        jobs.table.unfinished()
-        db.conn.set_progress_handler(None, 0)
+        look()
         db.conn.set_trace_callback(None)
     assert len(statements) <= 9
     assert not any("FROM boots" in statement for statement in statements)
-    assert steps < 15_000
+    assert steps_of(rig.store, look) < 15_000

@@ -136,15 +136,21 @@ def test_a_model_that_is_no_better_is_not_recommended_and_status_says_why(rig: M
     assert "would be refused now: it errs by 1 mm" in advice(rig)
 
 
-def test_a_comparison_with_another_live_model_is_made_again_by_itself_and_once(rig: ModelRig) -> None:
-    live, waiting = checked(rig)
+def compared_again_by_itself(rig: ModelRig, waiting: int) -> int | None:
+    """The model that was live at the one comparison that the scheduler has made again."""
     rig.jobs.start()
     rig.jobs.wait(lambda: comparisons(rig, waiting) == ["done"], "the comparison")
     rig.jobs.look_on()
     assert comparisons(rig, waiting) == ["done"]
     compared = rig.models.get(waiting).comparison
     assert compared is not None
-    assert compared["live"] == live
+    live: int | None = compared["live"]
+    return live
+
+
+def test_a_comparison_with_another_live_model_is_made_again_by_itself_and_once(rig: ModelRig) -> None:
+    live, waiting = checked(rig)
+    assert compared_again_by_itself(rig, waiting) == live
     assert f"`rigcal model accept {waiting}`" in advice(rig)
 
 
@@ -153,13 +159,7 @@ def test_a_comparison_with_a_live_model_that_was_rejected_is_made_again_by_itsel
     live, waiting = checked(rig)
     rig.compared(waiting, live=live)
     rig.registry.reject_command({"id": live, "reason": "trained on another prism"})
-    rig.jobs.start()
-    rig.jobs.wait(lambda: comparisons(rig, waiting) == ["done"], "the comparison")
-    rig.jobs.look_on()
-    assert comparisons(rig, waiting) == ["done"]
-    compared = rig.models.get(waiting).comparison
-    assert compared is not None
-    assert compared["live"] is None
+    assert compared_again_by_itself(rig, waiting) is None
 
 
 def test_a_comparison_that_fails_is_not_made_again_for_ever(rig: ModelRig) -> None:

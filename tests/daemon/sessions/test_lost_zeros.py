@@ -13,6 +13,7 @@ from daemon.store.upkeep.backup import CLOSE_OPEN_SESSIONS
 from drivers.readings import DeviceEvent, EventKind
 from tests.daemon.sessions.test_rig_file_changes import change_rig_file
 from tests.daemon.support.sessions import SOURCE, Rig, controlled
+from tests.daemon.support.store import steps_of
 
 LOST = f"{ZERO_LOST}theta1"
 
@@ -204,22 +205,6 @@ def flap(rig: Rig, times: int) -> None:
     rig.store.insert_records(events)
 
 
-def steps_of(rig: Rig, work: Callable[[], object]) -> int:
-    """Return the number of steps of SQLite's virtual machine; unlike time it is always the same."""
-    steps = 0
-
-    def count() -> int:
-        nonlocal steps
-        steps += 100
-        return 0
-
-    with rig.store.transaction() as db:
-        db.conn.set_progress_handler(count, 100)
-        work()
-        db.conn.set_progress_handler(None, 0)
-    return steps
-
-
 def test_an_encoder_that_jumps_at_every_frame_costs_no_more_after_many_jumps(session_rig: Rig) -> None:
     name, store = controlled(session_rig), session_rig.store
     jump(session_rig, "theta4", 0.0)
@@ -241,15 +226,15 @@ def test_an_encoder_that_jumps_at_every_frame_costs_no_more_after_many_jumps(ses
         "a restart": session_rig.new_keeper,
     }
     jump(session_rig, "theta4", 0.0)  # which takes all sessions away
-    few = {name: steps_of(session_rig, look) for name, look in looks.items()}
+    few = {name: steps_of(store, look) for name, look in looks.items()}
     flap(session_rig, 20_000)
-    many = {name: steps_of(session_rig, look) for name, look in looks.items()}
+    many = {name: steps_of(store, look) for name, look in looks.items()}
     assert all(many[name] <= 1.05 * few[name] + 500 for name in looks), (few, many)
     assert many["a jump is stored"] < 50_000, "of 300 closed sessions"
     assert sessions.zeros_lost() == ["theta4"]
     assert used(session_rig) == []
     store.update("models", {"id": model.id}, {"state": "retired"})
     check_zeros(session_rig, name)
-    assert steps_of(session_rig, looks["alarms"]) <= few["alarms"] + 500, "although an earlier word is asked for"
+    assert steps_of(store, looks["alarms"]) <= few["alarms"] + 500, "although an earlier word is asked for"
     assert sessions.zeros_lost() == [] == [*models.jumped(model)]
     assert not session_rig.say("show", id="copy 7")["not_used"].startswith(ZERO_LOST)

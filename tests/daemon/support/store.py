@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import sqlite3
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from daemon.store import Reader
+from daemon.store import Reader, Store
 from drivers.clock import Stamp
 from drivers.readings import CanCapture, Fix, LockState, Reading, SerialCapture, Status
 
@@ -68,3 +69,19 @@ def rows(path: Path, sql: str, **parameters: Any) -> list[dict[str, Any]]:
     with contextlib.closing(sqlite3.connect(path)) as db:
         db.row_factory = sqlite3.Row
         return [dict(row) for row in db.execute(sql, parameters)]
+
+
+def steps_of(store: Store, work: Callable[[], object]) -> int:
+    """Return the number of steps of SQLite's virtual machine; unlike time it is always the same."""
+    steps = 0
+
+    def count() -> int:
+        nonlocal steps
+        steps += 100
+        return 0
+
+    with store.transaction() as db:
+        db.conn.set_progress_handler(count, 100)
+        work()
+        db.conn.set_progress_handler(None, 0)
+    return steps

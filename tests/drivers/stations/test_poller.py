@@ -331,18 +331,7 @@ def test_a_broken_record_is_not_acknowledged() -> None:
 
 def test_a_set_station_is_stopped_set_to_track_and_asked_once() -> None:
     poller = sokkia("Xe")
-    play(
-        poller,
-        [
-            (0, "sent", b"\x12\r\n"),
-            (0, "sent", b"Xe\r\n"),
-            (0.1, "received", b"\x06"),
-            (0.8, "sent", b"\x11\r\n"),
-            (2, "received", SET_REPLY + b"\r\n"),
-            (3, "received", SET_REPLY + b"\r\n"),
-            (12.5, "received", SET_REPLY + b"\r\n"),
-        ],
-    )
+    streaming(poller, [(3, "received", SET_REPLY + b"\r\n"), (12.5, "received", SET_REPLY + b"\r\n")])
     assert list(poller.closing()) == [b"\x12\r\n"]
 
 
