@@ -175,20 +175,24 @@ class Commands:
         links = [link for link in self.parts.can_links if link.has_setups]
         if not links:
             raise CommandError("no CAN link of this rig has CANopen nodes to set up")
+        wanted = {link: nodes for link in links if (nodes := link.setup_nodes(permitted=True))}
         try:
-            for link in links:
-                link.check_setup()  # check all before any is set up, so that nothing is left half done
-            for link in links:
-                link.request_setup()
+            if not wanted:
+                links[0].check_setup()  # refused, with the reason
+            for link, nodes in wanted.items():
+                link.check_setup(nodes)  # check all before any is set up, so that nothing is left half done
+            for link, nodes in wanted.items():
+                link.request_setup(nodes)
         except TransmitForbiddenError as error:
             raise CommandError(f"{error}; set-up needs allow_transmit = true and transmit_nodes", REFUSED) from error
         except DeviceError as error:
             raise CommandError(str(error), FAILED) from error
-        names = ", ".join(link.name for link in links)
-        return {
-            "links": names,
-            "text": f"the nodes on {names} are being set up; `rigcal status` shows the result",
-        }
+        names = ", ".join(link.name for link in wanted)
+        text = f"the nodes on {names} are being set up; `rigcal status` shows the result"
+        forbidden = [f"{node} on {link.name}" for link in links for node in link.setup_nodes(permitted=False)]
+        if forbidden:
+            text += f"; not set up, because the configuration does not allow it: node {', '.join(forbidden)}"
+        return {"links": names, "text": text}
 
 
 def control_servers(config: Config, commands: Mapping[str, Handler]) -> tuple[list[ControlServer], dict[str, str]]:

@@ -88,6 +88,7 @@ class Daemon:
     def _compose(self, config: Config, store: Store, parts: Parts) -> None:
         self._ended_threads = EndedThreads()
         declare_channels(store, parts.rig)
+        store.try_events(parts.clock.now(), parts.rig.joint_names)
         self._watch = StoreWatch(store, parts.clock)
         self._housekeeping = Housekeeping(store, parts.clock, keeping_of(config))
         # Simulated and replayed rigs have their own clocks.
@@ -110,7 +111,7 @@ class Daemon:
             why_no_fix=lambda: self._acquisition.status().why_no_fix(),
         )
         models = ModelTable(store, parts.rig.name, parts.clock)
-        self._live_model = LiveModel(models, parts.rig)
+        self._live_model = LiveModel(models, parts.rig, lambda: store.knows_events)
         prism = config.tip.prism if config.tip is not None else None
         self._tip = LiveTip(
             parts.rig,
@@ -342,12 +343,8 @@ class Daemon:
             self._sessions.on_records(records)  # feeds the joiner, which the tip reads
         finally:
             if self._tip.on_records(records):  # also where no observation can be made: an encoder may have jumped
-                self._sessions.pending.once_stored(self._reload)
+                self._sessions.pending.once_stored(self._live_model.jump_stored)
             self._guide.on_records(records)
-
-    def _reload(self) -> None:
-        if self._store.stores_events:  # otherwise nothing would be known of the jump
-            self._live_model.changed()
 
 
 def _stop_part(stop: Callable[[], None]) -> None:

@@ -84,6 +84,10 @@ class CanLink:
         """True if any CANopen node of this link can be set up."""
         return bool(self._setups)
 
+    def setup_nodes(self, *, permitted: bool) -> list[int]:
+        """Return the numbers of the CANopen nodes that rigcal may set up, or else of those that it may not."""
+        return [node for node in self._setups if self._permission.allows(node) is permitted]
+
     def check_setup(self, nodes: Iterable[int] | None = None) -> None:
         """Raise the error that `request_setup` would raise now, without requesting anything."""
         self._wanted(nodes)

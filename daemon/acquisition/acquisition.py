@@ -317,7 +317,7 @@ class Acquisition:
         self._board.recall(self._decoding.begin(self._clock.now()))
 
     def _states(self, before: Stamp) -> Sequence[DeviceEvent]:
-        return self._store.unless_damaged(partial(device_states, self._store, before), [])
+        return self._store.events(partial(device_states, self._store, before))
 
     # ---- replay ----------------------------------------------------------------------------------------------------
 

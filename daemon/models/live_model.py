@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import logging
 import threading
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -23,6 +24,10 @@ log = logging.getLogger(__name__)
 
 NO_MODEL = "no model is live; `rigcal model list` shows the candidates"
 LOADING = "the live model is being loaded"
+UNKNOWN_JUMPS = (
+    "the live model cannot be used: the store is damaged, so it does not show which encoders have jumped or which "
+    "devices are faulty; restore a backup (`rigcal store restore`)"
+)
 JUMPED = "the reading of a joint has jumped; the live model is not used before that is stored"
 RETRY_S = 30.0  # after a failed load
 STOP_TIMEOUT_S = 5.0
@@ -89,11 +94,13 @@ class LiveModel(WorkerThread):
     Args:
         table: the store's models.
         rig: the machine, as described by the present rig file.
+        knows_jumps: returns False if the store is damaged so that it may not show an encoder's jump. No model is used
+            then.
     """
 
-    def __init__(self, table: ModelTable, rig: Rig) -> None:
+    def __init__(self, table: ModelTable, rig: Rig, knows_jumps: Callable[[], bool] = lambda: True) -> None:
         super().__init__("live-model", STOP_TIMEOUT_S)
-        self._table, self._rig = table, rig
+        self._table, self._rig, self.knows_jumps = table, rig, knows_jumps
         self._state: Loaded | Missing = Missing(LOADING)
         self._turn = threading.Lock()  # guards the state together with the mark that it is out of date
         self._changed = threading.Event()
@@ -109,7 +116,9 @@ class LiveModel(WorkerThread):
 
     def now(self) -> Loaded | Missing:
         """Return the live model, or the reason why there is none; from any thread."""
-        return self._state
+        state = self._state
+        is_unsafe = isinstance(state, Loaded) and not self.knows_jumps()
+        return Missing(UNKNOWN_JUMPS, is_defect=True) if is_unsafe else state
 
     def health(self) -> LiveModelHealth | None:
         """Return the faults of the live model; None if no model is live."""
@@ -129,11 +138,18 @@ class LiveModel(WorkerThread):
     def changed(self) -> None:
         """Load again, because a different model has gone live or what is known of the joints' zeros has changed."""
         with self._turn:
-            self._state, self._is_void = Missing(LOADING), False
+            if not self._is_void:
+                self._state = Missing(LOADING)
             self._changed.set()
 
+    def jump_stored(self) -> None:
+        """Load again after `void`, because the jump is stored."""
+        with self._turn:
+            self._is_void = False
+        self.changed()
+
     def void(self) -> None:
-        """Use the model no more until `changed` is called, because a jump of a joint's reading is not stored yet."""
+        """Use no model until `jump_stored` is called, because a jump of a joint's reading is not stored yet."""
         with self._turn:
             self._state, self._is_void = Missing(JUMPED), True
 

@@ -16,7 +16,7 @@ from typing import Any
 
 from calibration.errors import CalibrationError, ModelError, UnsafeError
 from daemon.commands import REFUSED, CommandError, caller_columns, text_argument
-from daemon.models.live_model import LiveModel
+from daemon.models.live_model import UNKNOWN_JUMPS, LiveModel
 from daemon.store.queries.models import REJECTED, ModelRow, ModelTable
 
 log = logging.getLogger(__name__)
@@ -139,6 +139,8 @@ class ModelRegistry:
                 "there is no model yet whose zeros could be confirmed; `rigcal session accept ID` confirms for a "
                 "session that it was measured with the present zeros"
             )
+        if not self._live.knows_jumps():
+            raise CommandError(f"no jump can be ignored: {UNKNOWN_JUMPS}", REFUSED)
         jumped = self._table.jumped(model)
         operator = text_argument(arguments, "operator")
         through = max(jumped.values(), default=0)

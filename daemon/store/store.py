@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 import sqlite3
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,7 +18,7 @@ from daemon.store.errors import StoreError, is_damage
 from daemon.store.rows import EXCERPT_BYTES, FIX_COLUMNS, SqlRow, counted_failures, fix_row, sample_row, sql_value
 from daemon.version import VERSION
 from drivers.clock import Stamp
-from drivers.readings import Capture, DecodeFailure, DeviceEvent, Fix, Gap, GapReason, Reading, Record
+from drivers.readings import Capture, DecodeFailure, DeviceEvent, EventKind, Fix, Gap, GapReason, Reading, Record
 
 log = logging.getLogger(__name__)
 
@@ -52,6 +53,10 @@ _UNDECODED = """SELECT chunk_id, captures FROM undecoded_chunks LEFT JOIN raw_ch
     WHERE chunk_id > ? ORDER BY chunk_id"""
 
 
+class _TriedError(Exception):
+    """Rolls back a transaction that was only tried."""
+
+
 class Store(Connection):
     """A store opened for writing.
 
@@ -75,6 +80,7 @@ class Store(Connection):
         self._channels: dict[tuple[str, str], tuple[int, ChannelKind]] = {}
         self._joints: frozenset[str] = frozenset()
         self._left_out: set[str] = set()  # statements that have met damage
+        self._are_events_unread = False
         self.run_id = 0
         self.begun: Stamp | None = None
         self.previous_end: Stamp | None = None
@@ -316,9 +322,25 @@ class Store(Connection):
             raise
 
     @property
-    def stores_events(self) -> bool:
-        """False once events of devices cannot be stored because their table is damaged."""
-        return _EVENTS not in self._left_out
+    def knows_events(self) -> bool:
+        """False once events of devices could not be stored or read because their table is damaged."""
+        return _EVENTS not in self._left_out and not self._are_events_unread
+
+    def events(self, read: Callable[[], list[DeviceEvent]]) -> list[DeviceEvent]:
+        """Return the events that `read` returns; none if it meets damage, which ends `knows_events`."""
+        found = self.unless_damaged(read, None)
+        self._are_events_unread |= found is None
+        return found or []
+
+    def try_events(self, now: Stamp, devices: Iterable[str]) -> None:
+        """Find out whether jumps of devices can be stored, which ends `knows_events` if they meet damage."""
+        tried = [DeviceEvent(device, now, EventKind.PRESET_JUMP, "") for device in devices]
+        with contextlib.suppress(_TriedError), self.transaction():
+            try:
+                self.insert_records(tried)
+            except sqlite3.DatabaseError as error:
+                self.note_damage(error)
+            raise _TriedError
 
     def newest_events(self, most: int) -> list[dict[str, Any]]:
         """Return device, utc_ns, kind and text of the newest device events, newest first."""

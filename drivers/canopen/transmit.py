@@ -59,10 +59,14 @@ class TransmitPermission:
                 self._link, "the link is listen-only; set allow_transmit = true and list the nodes to transmit"
             )
 
+    def allows(self, node: int) -> bool:
+        """Return True if `node` may be addressed."""
+        return self._allow_transmit and node in self._nodes
+
     def check_node(self, node: int) -> None:
         """Raise TransmitForbiddenError unless `node` may be addressed."""
         self.check_link()
-        if node not in self._nodes:
+        if not self.allows(node):
             known = ", ".join(map(str, sorted(self._nodes))) or "none"
             raise TransmitForbiddenError(self._link, f"node {node} is not listed in transmit_nodes (listed: {known})")
 

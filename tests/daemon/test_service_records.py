@@ -1,14 +1,20 @@
 """The daemon's parts hear of what was stored, whatever one of them does with it."""
 
+import contextlib
 from dataclasses import replace
 from pathlib import Path
 
+import pytest
+
+from daemon.commands import CommandError
 from daemon.composition import Parts, joiner
+from daemon.models.live_model import JUMPED, LOADING, Loaded, Missing
 from daemon.service import Daemon
 from daemon.store.store import _EVENTS, Store
 from drivers.can.tip_frames import TipStatus
 from drivers.clock import ManualClock
 from drivers.readings import DeviceEvent, EventKind, Fix, LockState, Reading, Record, Status
+from tests.daemon.support.damage import tear
 from tests.daemon.support.jobs import SOURCE
 from tests.daemon.support.models import ModelRig, pose, wait
 
@@ -72,7 +78,50 @@ def test_there_is_no_tip_from_a_jump_on_whatever_cannot_be_stored_or_is_stored_l
         store._left_out.add(_EVENTS)  # as after damage of their table
         keep(read(replace(jump, stamp=clock.now())))
         assert status() is TipStatus.NO_MODEL, "the store cannot tell that a joint has jumped"
-        assert "not used before that is stored" in daemon._tip.tip("r").reason
+        wait(lambda: status() is TipStatus.MODEL_UNUSABLE)
+        assert "the store is damaged" in daemon._tip.tip("r").reason
     finally:
         daemon.close()
         store.close()
+
+
+def test_there_is_no_tip_while_damage_of_the_store_hides_jumps_whatever_is_commanded(tmp_path: Path) -> None:
+    made = ModelRig(tmp_path)
+    made.accepted(30)
+    made.accepted(40)
+    clock = RealClock(made.clock.now())
+    made.close()
+    config = made.config.model_copy(update={"socket": tmp_path / "socket"})
+    tear(config.store_path, "device_events")
+    with contextlib.closing(Store(config.store_path)) as store:
+        parts = Parts("live", SOURCE.rig, SOURCE.text, clock, [], {}, joiner(config, SOURCE.rig))
+        daemon = Daemon(config, store, parts)
+        try:
+            daemon._live_model.start()
+            wait(lambda: daemon._tip.tip("r").reason != LOADING)
+            assert "the store is damaged" in daemon._tip.tip("r").reason
+            daemon._models.rollback_command({"operator": "Ada"})
+            wait(lambda: daemon._tip.tip("r").reason != LOADING)
+            assert "the store is damaged" in daemon._tip.tip("r").reason
+            with pytest.raises(CommandError, match="no jump can be ignored"):
+                daemon._models.zeros_checked_command({"operator": "Ada"})
+            health = daemon._live_model.health()
+            assert health is not None
+            assert "restore a backup" in health.defect
+        finally:
+            daemon.close()
+
+
+def test_a_model_that_is_put_back_gives_no_tip_before_a_jump_is_stored(tmp_path: Path) -> None:
+    made = ModelRig(tmp_path)
+    try:
+        made.accepted(30)
+        made.accepted(40)
+        wait(lambda: isinstance(made.live.now(), Loaded))
+        made.live.void()
+        made.registry.rollback_command({"operator": "Ada"})
+        assert made.live.now() == Missing(JUMPED)
+        made.live.jump_stored()
+        wait(lambda: isinstance(made.live.now(), Loaded))
+    finally:
+        made.close()

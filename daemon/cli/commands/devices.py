@@ -22,7 +22,7 @@ def devices() -> None:
 def devices_configure(machine_is_parked: bool, **where: Any) -> Any:
     """Check, configure and start the encoders.
 
-    Identity and resolution are checked, and transmission is configured. Requires a link with allow_transmit = true and
-    the nodes in transmit_nodes.
+    Identity and resolution are checked, and transmission is configured. Requires a link with allow_transmit = true.
+    Only nodes in its transmit_nodes are set up.
     """
     return ask(where, "devices.configure", lambda result: echo(result["text"]), machine_is_parked=machine_is_parked)

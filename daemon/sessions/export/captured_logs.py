@@ -22,7 +22,7 @@ from daemon.store.queries.sessions import AFTER_NS, BEFORE_NS, prism_confirmatio
 from daemon.store.queries.setups import control_points
 from daemon.store.reader import Reader
 from daemon.store.upkeep.full_samples import stretches_of_session
-from drivers.clock import Stamp
+from drivers.clock import NS_PER_S, Stamp
 from drivers.logs.can_log import write_can_log
 from drivers.logs.serial_log import SerialLogHeader, SerialLogWriter
 from drivers.readings import CanCapture, Capture, SerialCapture
@@ -33,7 +33,7 @@ TimesAway = Callable[[Reader, str], Iterable[Away]]
 
 JOINED_WITHIN_S = 5.0  # after the session's end, if links are alive; a killed daemon joins no more fixes
 LOOK_S = 0.1
-_BETWEEN_BOOTS_NS = 1_000_000  # smallest distance of boots: logs have microseconds, and the order must be kept
+_OUTAGE_NS = 3600 * NS_PER_S  # assumed between two boots if the clock does not show it; joints may be anywhere by then
 
 
 def export_session(
@@ -166,9 +166,9 @@ def ended_session(reader: Reader, session_id: str) -> dict[str, Any]:
 class _SteadyTime:
     """Puts instants on one axis of UTC without steps of the computer's clock.
 
-    Within a boot, time follows the monotonic clock from the UTC of the boot's first instant; a boot never begins before
-    the previous one ends. The first and the last instant of each boot, of all links, must be given first, because one
-    link may have fallen silent before the others.
+    Within a boot, time follows the monotonic clock from the UTC of the boot's first instant; a boot that seems to begin
+    before the previous one ends is taken to begin an hour later. The first and the last instant of each boot, of all
+    links, must be given first, because one link may have fallen silent before the others.
     """
 
     def __init__(self) -> None:
@@ -178,9 +178,9 @@ class _SteadyTime:
     def of(self, stamp: Stamp) -> Stamp:
         """Return the stamp with steady UTC instead of the computer's."""
         if stamp.boot_id not in self._offsets_ns:
-            self._offsets_ns[stamp.boot_id] = (
-                max(stamp.utc_ns, self._latest_ns + _BETWEEN_BOOTS_NS) - stamp.monotonic_ns
-            )
+            is_after = stamp.utc_ns > self._latest_ns
+            begun_ns = stamp.utc_ns if is_after else self._latest_ns + _OUTAGE_NS
+            self._offsets_ns[stamp.boot_id] = begun_ns - stamp.monotonic_ns
         utc_ns = stamp.monotonic_ns + self._offsets_ns[stamp.boot_id]
         self._latest_ns = max(self._latest_ns, utc_ns)
         return replace(stamp, utc_ns=utc_ns)

@@ -256,3 +256,4 @@ def test_damage_to_what_devices_have_told_keeps_no_reading_from_being_decoded(pa
         Acquisition([], DECODERS, store, SystemClock(), on_records=lambda _: None).run_inline([capture(PDO)])
         assert statuses(store) == ["ok"]
         assert store.damage
+        assert not store.knows_events

@@ -130,6 +130,13 @@ def test_a_check_raises_what_a_request_would_and_asks_for_nothing() -> None:
     assert {frame.arbitration_id for frame in heard.sent} == {0x621}
 
 
+def test_a_link_tells_which_nodes_it_may_set_up() -> None:
+    one_listed = virtual_link(unused_channel(), **(BOTH | {"transmit_nodes": (32,)}))
+    assert (one_listed.setup_nodes(permitted=True), one_listed.setup_nodes(permitted=False)) == ([32], [33])
+    listening = virtual_link(unused_channel(), setups=[setup()])
+    assert (listening.setup_nodes(permitted=True), listening.setup_nodes(permitted=False)) == ([], [32])
+
+
 def test_a_link_tells_whether_it_has_nodes_to_set_up() -> None:
     assert virtual_link(unused_channel(), **BOTH).has_setups
     assert not virtual_link(unused_channel()).has_setups

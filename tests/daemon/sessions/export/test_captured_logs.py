@@ -6,14 +6,16 @@ from pathlib import Path
 
 import pytest
 
+from daemon.composition import decoders
 from daemon.config.config import parse_config
 from daemon.guide.times_away import times_away
+from daemon.rig_files import load_rig
 from daemon.sessions.export.captured_logs import CanFormat, export_session
 from daemon.sessions.export.session_file import read_session_file
 from daemon.sessions.replay import merged
 from daemon.store.errors import StoreError
 from drivers.clock import NS_PER_S, Stamp
-from drivers.readings import CanCapture, DeviceEvent, EventKind, SerialCapture
+from drivers.readings import CanCapture, DeviceEvent, EventKind, Reading, SerialCapture
 from tests.daemon.support.sessions import Rig
 
 CONFIG = """
@@ -93,6 +95,28 @@ def test_a_link_that_fell_silent_before_a_reboot_comes_beside_the_others_of_the_
             apart.append(max(abs(second - seconds[-1]) for seconds in came.values() if seconds[-1] > REBOOT_S))
     assert came == {"boom": boom, "ts": ts}
     assert max(apart) <= 1
+
+
+@pytest.mark.parametrize("behind_s", [0, 7200])
+def test_a_joint_that_moved_while_the_computer_was_off_has_not_jumped_in_a_replay(
+    tmp_path: Path, behind_s: int
+) -> None:
+    config = parse_config(CONFIG, tmp_path / "rigcal.toml")
+    rig = with_a_session(config.store_path)
+    for boot, degrees in ((range(1, 120), 10.0), (range(3730, 3850), 100.0)):
+        stamps = [at_second(second, behind_s) for second in boot]
+        rig.clock.set(stamps[0])
+        rig.store.begin_run(rig.clock.now())
+        counts = round(20_000 + degrees / 360 * 65_536).to_bytes(4, "little")
+        rig.store.mark_decoded(rig.store.append_captures([CanCapture("boom", at, 0x1A0, counts) for at in stamps]))
+        rig.clock.set(stamps[-1])
+    close(rig)
+    logs = [path for path in export_session(config, "s1", tmp_path / "out", "log", times_away) if path.suffix != ".csv"]
+    told = read_session_file(logs.pop())
+    decoder = decoders(config, load_rig("swdt82"))["boom"]()
+    records = [record for capture in merged(logs, config, told) for record in decoder.feed(capture)]
+    assert sum(isinstance(record, Reading) for record in records) == 239
+    assert [record for record in records if isinstance(record, DeviceEvent)] == []
 
 
 def test_a_damaged_store_leaves_no_part_of_a_session_s_logs(tmp_path: Path) -> None:
