@@ -145,7 +145,7 @@ class ModelRig:
         has_jumped = self.tip.on_records(records)
         self.store.insert_records(records)
         if has_jumped:
-            self.live.changed()
+            self.live.jump_stored()
 
 
 def wait(done: Callable[[], bool]) -> None:
