@@ -30,7 +30,7 @@ from calibration.model.model import CalibratedModel
 from calibration.observations import Observations, parse_observations
 from calibration.pipeline.calibrate import train_residual
 from calibration.pipeline.find_gap import find_gap
-from calibration.pipeline.known_inputs import where_known
+from calibration.pipeline.known_inputs import rows_of_fit
 from calibration.rig.description import Rig, parse_rig
 from calibration.run_settings import Progress, Run
 from daemon.host.safe_output import write_file
@@ -180,9 +180,9 @@ def _held_out(order: Order, rig: Rig, training: Observations) -> Observations | 
 
 
 def _trained_on(order: Order, model: CalibratedModel) -> Observations:
-    """Return the training rows of a model: those at its set-ups in which the inputs of its effects are known."""
+    """Return the training rows of a model: those to which it was fitted, at the set-ups whose base it includes."""
     observations = _observations(order, model.rig, order.train_ids)
-    return where_known(model, observations.select(np.isin(observations.setup, list(model.placements))))
+    return rows_of_fit(model, observations.select(np.isin(observations.setup, list(model.placements))))
 
 
 def _train_residual(order: Order, progress: Progress) -> dict[str, Any]:

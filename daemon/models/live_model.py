@@ -138,15 +138,18 @@ class LiveModel(WorkerThread):
     def changed(self) -> None:
         """Load again, because a different model has gone live or what is known of the joints' zeros has changed."""
         with self._turn:
-            if not self._is_void:
-                self._state = Missing(LOADING)
-            self._changed.set()
+            self._load_again()
 
     def jump_stored(self) -> None:
         """Load again after `void`, because the jump is stored."""
         with self._turn:
             self._is_void = False
-        self.changed()
+            self._load_again()
+
+    def _load_again(self) -> None:
+        if not self._is_void:
+            self._state = Missing(LOADING)
+        self._changed.set()
 
     def void(self) -> None:
         """Use no model until `jump_stored` is called, because a jump of a joint's reading is not stored yet."""

@@ -33,7 +33,7 @@ TimesAway = Callable[[Reader, str], Iterable[Away]]
 
 JOINED_WITHIN_S = 5.0  # after the session's end, if links are alive; a killed daemon joins no more fixes
 LOOK_S = 0.1
-_OUTAGE_NS = 3600 * NS_PER_S  # assumed between two boots if the clock does not show it; joints may be anywhere by then
+_OUTAGE_NS = 300 * NS_PER_S  # assumed between two boots if the clock does not show it; joints may be anywhere by then
 
 
 def export_session(
@@ -167,8 +167,8 @@ class _SteadyTime:
     """Puts instants on one axis of UTC without steps of the computer's clock.
 
     Within a boot, time follows the monotonic clock from the UTC of the boot's first instant; a boot that seems to begin
-    before the previous one ends is taken to begin an hour later. The first and the last instant of each boot, of all
-    links, must be given first, because one link may have fallen silent before the others.
+    before the previous one ends is taken to begin five minutes later. The first and the last instant of each boot, of
+    all links, must be given first, because one link may have fallen silent before the others.
     """
 
     def __init__(self) -> None:
