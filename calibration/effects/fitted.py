@@ -229,31 +229,15 @@ def corrected(observations: Observations, change: Floats, names: Sequence[str]) 
     return replace(observations, joints=joints)
 
 
-def inputs_known(effects: Sequence[FittedEffect], context: EffectContext) -> NDArray[np.bool_]:
-    """Return an (n,) mask of the observations in which all inputs of all effects are known."""
-    known = np.ones(len(context), dtype=bool)
-    for effect in effects:
-        known &= _known(effect, context)
-    return known
-
-
-def lacking_inputs(effects: Sequence[FittedEffect], context: EffectContext) -> list[tuple[FittedEffect, str, int]]:
-    """Return the effects whose inputs are missing in some observations, with the inputs and the number of these."""
-    found = []
+def missing_inputs(effects: Sequence[FittedEffect], context: EffectContext) -> tuple[str, ...]:
+    """Return a sentence for every effect whose inputs are missing in some of these observations."""
+    sentences = []
     for effect in effects:
         needs = library()[effect.family].needs(effect.where) or (effect.regime.variable if effect.regime else "")
         lacking = int((~_known(effect, context)).sum())
         if lacking:
-            found.append((effect, needs, lacking))
-    return found
-
-
-def missing_inputs(effects: Sequence[FittedEffect], context: EffectContext) -> tuple[str, ...]:
-    """Return a sentence for every effect whose inputs are missing in some of these observations."""
-    sentences = []
-    for effect, needs, lacking in lacking_inputs(effects, context):
-        rows = "" if lacking == len(context) else f" in {lacking} of {len(context)} rows"
-        sentences.append(f"{effect.family}@{effect.where} is left out{rows}: this data lacks {needs}")
+            rows = "" if lacking == len(context) else f" in {lacking} of {len(context)} rows"
+            sentences.append(f"{effect.family}@{effect.where} is left out{rows}: this data lacks {needs}")
     return tuple(sentences)
 
 

@@ -16,7 +16,6 @@ from calibration.model.prediction import OUTLIER_SIGMA, Predictor
 from calibration.numerics.single_thread import one_blas_thread
 from calibration.observations import Observations, is_original
 from calibration.pipeline.build_model import build_model
-from calibration.pipeline.known_inputs import fitted_where_known, rows_of_fit
 from calibration.pipeline.methods import METHODS, Task, identify_by
 from calibration.residual.features import Features, usable_loads, usable_signals, usable_torques
 from calibration.residual.folds import group_labels, standstill_labels
@@ -65,7 +64,6 @@ def calibrate(
     """
     observations = observations.numbered()
     model = identify(rig, rig_text, observations, prior=prior, method=method, effects=effects, run=run.part(0.0, 0.4))
-    observations = rows_of_fit(model, observations)
     kind = METHODS[method].residual if residual == "default" else residual
     if kind == "torque network":
         model = compensate_torques(model, observations, seed=run.seed)
@@ -99,12 +97,7 @@ def identify(
     require_positions(observations)
     observations = observations.numbered()
     with run.workers() as pool:
-        _, observations, adopted = fitted_where_known(
-            observations,
-            replace(run, executor=pool),
-            lambda rows, own: identify_by(method, Task(rig, rows, prior, effects, own)),
-            lambda found: found,
-        )
+        adopted = identify_by(method, Task(rig, observations, prior, effects, replace(run, executor=pool)))
         return build_model(rig, rig_text, observations, adopted, prior, {"seed": run.seed, "method": method})
 
 

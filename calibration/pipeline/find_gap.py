@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator
 from dataclasses import replace
-from operator import attrgetter
 
 import numpy as np
 
@@ -29,7 +28,6 @@ from calibration.model.warnings import model_warnings
 from calibration.observations import Floats, Observations, are_among
 from calibration.pipeline.build_model import build_model
 from calibration.pipeline.calibrate import require_known_setups
-from calibration.pipeline.known_inputs import fitted_where_known
 from calibration.pipeline.methods import effects_rng, find_effects
 from calibration.residual.folds import folds
 from calibration.rig.description import Rig
@@ -83,14 +81,9 @@ def find_gap(
     with run.workers() as pool:
         run = replace(run, executor=pool)
         rng = effects_rng(run.seed)
-        rest, observations, adopted = fitted_where_known(
-            observations,
-            run.part(0.0, 0.9),
-            lambda rows, own: find_effects(rig, rows, families, prior, own, rng),
-            attrgetter("adopted"),
-        )
+        rest = find_effects(rig, observations, families, prior, run.part(0.0, 0.9), rng)
         run.progress(0.9, "building the model")
-        model = build_model(rig, rig_text, observations, adopted, prior, {"seed": run.seed, "method": "gap"})
+        model = build_model(rig, rig_text, observations, rest.adopted, prior, {"seed": run.seed, "method": "gap"})
         return _answer(rest, model, families, observations, holdout, run.seed, rng)
 
 

@@ -30,7 +30,6 @@ from calibration.model.model import CalibratedModel
 from calibration.observations import Observations, parse_observations
 from calibration.pipeline.calibrate import train_residual
 from calibration.pipeline.find_gap import find_gap
-from calibration.pipeline.known_inputs import rows_of_fit
 from calibration.rig.description import Rig, parse_rig
 from calibration.run_settings import Progress, Run
 from daemon.host.safe_output import write_file
@@ -140,8 +139,7 @@ def _find_gap(order: Order, progress: Progress) -> dict[str, Any]:
         sources = {"sessions": ", ".join(order.session_ids), "held-out sessions": checks}
         facts = _facts(order, found.model, (*order.session_ids, *order.held_out_ids), directory.name)
         sha256 = write_gap(directory, found, answer, gap_report(found, provenance(found.model, None, sources), facts))
-    stage = "effects" if found.effects else "geometric"
-    made = _made(directory / MODEL, sha256, found.model, stage, found.observations)
+    made = _made(directory / MODEL, sha256, found.model, "effects" if found.effects else "geometric", observations)
     return made | {
         "sessions": list(order.session_ids),
         "gap": found.as_dict(),
@@ -180,9 +178,9 @@ def _held_out(order: Order, rig: Rig, training: Observations) -> Observations | 
 
 
 def _trained_on(order: Order, model: CalibratedModel) -> Observations:
-    """Return the training rows of a model: those to which it was fitted, at the set-ups whose base it includes."""
+    """Return the training rows of a model: those at the set-ups whose base it includes."""
     observations = _observations(order, model.rig, order.train_ids)
-    return rows_of_fit(model, observations.select(np.isin(observations.setup, list(model.placements))))
+    return observations.select(np.isin(observations.setup, list(model.placements)))
 
 
 def _train_residual(order: Order, progress: Progress) -> dict[str, Any]:
