@@ -335,11 +335,8 @@ class Store(Connection):
     def try_events(self, now: Stamp, devices: Iterable[str]) -> None:
         """Find out whether jumps of devices can be stored, which ends `knows_events` if they meet damage."""
         tried = [DeviceEvent(device, now, EventKind.PRESET_JUMP, "") for device in devices]
-        with contextlib.suppress(_TriedError), self.transaction():
-            try:
-                self.insert_records(tried)
-            except sqlite3.DatabaseError as error:
-                self.note_damage(error)
+        with contextlib.suppress(_TriedError, sqlite3.DatabaseError), self.transaction():
+            self.insert_records(tried)
             raise _TriedError
 
     def newest_events(self, most: int) -> list[dict[str, Any]]:

@@ -7,27 +7,17 @@ from pathlib import Path
 import pytest
 
 from daemon.commands import CommandError
-from daemon.composition import Parts, joiner
-from daemon.config.config import Config
 from daemon.control.protocol import request
-from daemon.service import Daemon
-from daemon.store import Store
 from drivers.can_link import CanLink
-from drivers.clock import SystemClock
 from tests.daemon.support.acquisition import wait_until
-from tests.daemon.support.idle_daemon import running
-from tests.daemon.support.jobs import SOURCE
+from tests.daemon.support.idle_daemon import idle_daemon
 from tests.drivers.can_support import unused_channel, virtual_link
 from tests.drivers.canopen.test_can_setup_requests import BOTH
 
 
 def told(tmp_path: Path, *links: CanLink) -> str:
     """The answer of a daemon with these links to `rigcal devices configure`."""
-    config = Config(rig="swdt82", state_directory=tmp_path)
-    store, clock = Store(config.store_path), SystemClock()
-    rig = joiner(config, SOURCE.rig)
-    parts = Parts("live", SOURCE.rig, SOURCE.text, clock, links, {}, rig, can_links=links)
-    with running(Daemon(config, store, parts), store):
+    with idle_daemon(tmp_path, links=links) as config:
         wait_until(lambda: all(link.read_until is not None for link in links))
         answer: str = request(config.socket_path, "devices.configure", {"machine_is_parked": True})["text"]
         return answer

@@ -1,6 +1,7 @@
 """The daemon's parts hear of what was stored, whatever one of them does with it."""
 
 import contextlib
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -26,35 +27,44 @@ class RealClock(ManualClock):
         return seconds
 
 
+@contextlib.contextmanager
+def daemon_after(made: ModelRig) -> Iterator[tuple[Daemon, Store, RealClock]]:
+    """A daemon on the store of a rig that is closed; only its live model runs."""
+    clock = RealClock(made.clock.now())
+    config = made.config.model_copy(update={"socket": made.jobs.directory / "socket"})
+    with contextlib.closing(Store(config.store_path)) as store:
+        parts = Parts("live", SOURCE.rig, SOURCE.text, clock, [], {}, joiner(config, SOURCE.rig))
+        daemon = Daemon(config, store, parts)
+        try:
+            daemon._live_model.start()
+            yield daemon, store, clock
+        finally:
+            daemon.close()
+
+
 def test_there_is_no_tip_from_a_jump_on_whatever_cannot_be_stored_or_is_stored_late(tmp_path: Path) -> None:
     made = ModelRig(tmp_path)
     made.accepted()
-    clock = RealClock(made.clock.now())
     made.close()
-    config = made.config.model_copy(update={"socket": tmp_path / "socket"})
-    store = Store(config.store_path)
-    parts = Parts("live", SOURCE.rig, SOURCE.text, clock, [], {}, joiner(config, SOURCE.rig))
-    daemon = Daemon(config, store, parts)
+    with daemon_after(made) as (daemon, store, clock):
 
-    def read(*more: Record) -> list[Record]:
-        clock.advance(0.1)
-        now = clock.now()
-        readings = [Reading(j.name, now, pose(1)[j.name], j.unit) for j in SOURCE.rig.joints]
-        fix = Fix("station", now, now, Status.OK, LockState.LOCKED, 0.1, 1.5, 8.0)
-        records: list[Record] = [*more, *readings, fix]
-        daemon._on_records(records)
-        return records
+        def read(*more: Record) -> list[Record]:
+            clock.advance(0.1)
+            now = clock.now()
+            readings = [Reading(j.name, now, pose(1)[j.name], j.unit) for j in SOURCE.rig.joints]
+            fix = Fix("station", now, now, Status.OK, LockState.LOCKED, 0.1, 1.5, 8.0)
+            records: list[Record] = [*more, *readings, fix]
+            daemon._on_records(records)
+            return records
 
-    def keep(records: list[Record]) -> None:
-        with store.transaction():
-            store.insert_records(records)
-            daemon._sessions.pending.store()
+        def keep(records: list[Record]) -> None:
+            with store.transaction():
+                store.insert_records(records)
+                daemon._sessions.pending.store()
 
-    def status() -> TipStatus:
-        return daemon._tip.tip("r").status
+        def status() -> TipStatus:
+            return daemon._tip.tip("r").status
 
-    try:
-        daemon._live_model.start()
         wait(lambda: status() is not TipStatus.NO_MODEL)
         daemon._setups.new_command({"id": "S1"})
         daemon._sessions.start_command({"prism": "r"})
@@ -80,36 +90,25 @@ def test_there_is_no_tip_from_a_jump_on_whatever_cannot_be_stored_or_is_stored_l
         assert status() is TipStatus.NO_MODEL, "the store cannot tell that a joint has jumped"
         wait(lambda: status() is TipStatus.MODEL_UNUSABLE)
         assert "the store is damaged" in daemon._tip.tip("r").reason
-    finally:
-        daemon.close()
-        store.close()
 
 
 def test_there_is_no_tip_while_damage_of_the_store_hides_jumps_whatever_is_commanded(tmp_path: Path) -> None:
     made = ModelRig(tmp_path)
     made.accepted(30)
     made.accepted(40)
-    clock = RealClock(made.clock.now())
     made.close()
-    config = made.config.model_copy(update={"socket": tmp_path / "socket"})
-    tear(config.store_path, "device_events")
-    with contextlib.closing(Store(config.store_path)) as store:
-        parts = Parts("live", SOURCE.rig, SOURCE.text, clock, [], {}, joiner(config, SOURCE.rig))
-        daemon = Daemon(config, store, parts)
-        try:
-            daemon._live_model.start()
-            wait(lambda: daemon._tip.tip("r").reason != LOADING)
-            assert "the store is damaged" in daemon._tip.tip("r").reason
-            daemon._models.rollback_command({"operator": "Ada"})
-            wait(lambda: daemon._tip.tip("r").reason != LOADING)
-            assert "the store is damaged" in daemon._tip.tip("r").reason
-            with pytest.raises(CommandError, match="no jump can be ignored"):
-                daemon._models.zeros_checked_command({"operator": "Ada"})
-            health = daemon._live_model.health()
-            assert health is not None
-            assert "restore a backup" in health.defect
-        finally:
-            daemon.close()
+    tear(made.config.store_path, "device_events")
+    with daemon_after(made) as (daemon, _, _):
+        wait(lambda: daemon._tip.tip("r").reason != LOADING)
+        assert "the store is damaged" in daemon._tip.tip("r").reason
+        daemon._models.rollback_command({"operator": "Ada"})
+        wait(lambda: daemon._tip.tip("r").reason != LOADING)
+        assert "the store is damaged" in daemon._tip.tip("r").reason
+        with pytest.raises(CommandError, match="no jump can be ignored"):
+            daemon._models.zeros_checked_command({"operator": "Ada"})
+        health = daemon._live_model.health()
+        assert health is not None
+        assert "restore a backup" in health.defect
 
 
 def test_a_model_that_is_put_back_gives_no_tip_before_a_jump_is_stored(tmp_path: Path) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,16 +14,21 @@ from daemon.config.sections import JobsSection
 from daemon.host.systemd import Notifier
 from daemon.service import Daemon
 from daemon.store.store import Store
+from drivers.can_link import CanLink
 from drivers.clock import SystemClock
 from tests.daemon.support.jobs import SOURCE
 
 
 @contextlib.contextmanager
-def idle_daemon(directory: Path, notifier: Notifier | None = None, **settings: Any) -> Iterator[Config]:
+def idle_daemon(
+    directory: Path, notifier: Notifier | None = None, links: Sequence[CanLink] = (), **settings: Any
+) -> Iterator[Config]:
     """A daemon that runs while the block does; its store is in `directory`, and so is its control socket."""
     config = Config(rig="swdt82", state_directory=directory, jobs=JobsSection(enabled=False), **settings)
     store = Store(config.store_path)
-    parts = Parts("live", SOURCE.rig, SOURCE.text, SystemClock(), [], {}, joiner(config, SOURCE.rig))
+    parts = Parts(
+        "live", SOURCE.rig, SOURCE.text, SystemClock(), links, {}, joiner(config, SOURCE.rig), can_links=links
+    )
     daemon = Daemon(config, store, parts)
     with running(daemon, store, notifier):
         yield config
