@@ -7,6 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from calibration.effects.columns import EffectColumns
+from calibration.effects.fitted import FittedEffect
 from calibration.gap.adoption import Adopted, adopted
 from calibration.gap.background.blocks import displacement_blocks, possible_blocks, smooth_blocks, time_blocks
 from calibration.gap.background.breaks import find_break
@@ -30,12 +32,21 @@ from calibration.gap.regimes import effect_in_regime
 from calibration.gap.screening import by_family
 from calibration.gap.search_result import STRUCTURE, SearchResult
 from calibration.gap.stepwise.search import MANY_OUTLIERS, StepwiseSearch
+from calibration.gap.unknown_inputs import (
+    filled_in,
+    implausible_unknowns,
+    unknown_inputs,
+    with_unknowns,
+    without_unknowns,
+)
 from calibration.identification.reading_steps import in_true_steps
 from calibration.identification.refinement import Prior
 from calibration.identification.solve import Solution
 from calibration.observations import Observations
 
 _REGIME = 15.0  # log Bayes factor required of an effect in a part of the data, as variable and border are selected
+_MOST_REPEATS = 5  # of the search, as effects that lack inputs in some rows may be found with unknowns for others
+_CONTRADICTION = 15.0  # nats that an unknown larger than its effect can be counts against it
 _LEAST_SAMPLES = 60  # with fewer samples, the evidence of a background may come from a few fixes
 
 
@@ -56,22 +67,72 @@ def search(
         prior: prior of the solution.
         seed: random seed of half-samples and folds.
     """
+    observations = filled_in(observations, solution.samples)
     seen = in_true_steps(solution, observations, prior)
-    problem = Problem(seen, observations, prior, seed)
+    found, unknowns = _with_unknowns(Problem(seen, observations, prior, seed), families)
+    if seen is not solution:
+        # The model uses the reading noise of its rig file, and counts additional noise as scatter.
+        given = solution if unknowns is None else with_unknowns(solution, unknowns, prior)
+        outcome = Adopted(given, given.fit, reason=found.adopted.reason)
+        if found.joint.choices:
+            joint = joint_fit(given, observations, found.joint.choices, prior, found.joint.fit.x)
+            outcome = adopted(given, joint, found.adopted.reason)
+        found = replace(found, adopted=outcome)
+    return found if unknowns is None else replace(found, adopted=without_unknowns(found.adopted, unknowns))
+
+
+def _with_unknowns(problem: Problem, families: Collection[str]) -> tuple[SearchResult, EffectColumns | None]:
+    """Return the effects that the data require, and the unknowns of samples that lack inputs of these effects.
+
+    The search is repeated with these unknowns. An unknown that is larger than its effect can be has another cause: if
+    that gets a name without the unknown, it is left out.
+    """
+    solution, samples = problem.solution, problem.solution.samples
+    first = found = _search(problem, families)
+    effects, unknowns, implausible = _lack_inputs(found) or _may_lack_inputs(found), None, set[str]()
+    for _ in range(_MOST_REPEATS):
+        lacking = unknown_inputs(effects, found.joint.context, samples, implausible)
+        if lacking is None or (unknowns is not None and lacking.names == unknowns.names):
+            break
+        tried = _search(replace(problem, solution=with_unknowns(solution, lacking, problem.prior)), families)
+        if implausible and not _names_more(tried, found):
+            break
+        found, unknowns = tried, lacking
+        effects = _lack_inputs(found)
+        implausible |= set(implausible_unknowns(found.joint, unknowns))
+    return (found, unknowns) if unknowns is not None and effects else (first, None)
+
+
+def _lack_inputs(found: SearchResult) -> list[FittedEffect]:
+    """Return the effects of a result that lack inputs in some rows."""
+    context, samples = found.joint.context, found.problem.solution.samples
+    return [effect for effect in found.joint.effects if unknown_inputs([effect], context, samples) is not None]
+
+
+def _may_lack_inputs(found: SearchResult) -> list[FittedEffect]:
+    """Return the most probable effect not in a result that lacks inputs in some rows, as a list; empty for none."""
+    context, samples = found.joint.context, found.problem.solution.samples
+    scored = [*found.alternatives, *(one for one in found.steps[0].scored if one.log_bayes_factor > 0.0)]
+    effects = [one.fitted(context) for one in scored]
+    return [effect for effect in effects if unknown_inputs([effect], context, samples) is not None][:1]
+
+
+def _names_more(tried: SearchResult, found: SearchResult) -> bool:
+    """Return True if a result has all names of another and a further one, and explains the samples about as well."""
+    names, known = (set(map(str, one.joint.choices)) for one in (tried, found))
+    return names > known and tried.joint.fit.cost < found.joint.fit.cost + _CONTRADICTION
+
+
+def _search(problem: Problem, families: Collection[str]) -> SearchResult:
+    """Return the effects that the data require, and the break of the machine if there is one."""
     whole = StepwiseSearch(problem, families)
     found = _in_regimes(problem, families, whole.run(), whole.least_cost)
     found = _with_background(problem, families, found)
     broken = find_break(problem, found.joint)
-    if broken is not None:
-        by_formulas = formulas_log_bayes_factor(problem, found.joint, found.strongest_formula)
-        found = replace(found, machine_break=broken if broken.log_bayes_factor > by_formulas else None)
-    if seen is solution:
+    if broken is None:
         return found
-    # The model uses the reading noise of its rig file, and counts additional noise as scatter.
-    if not found.joint.choices:
-        return replace(found, adopted=Adopted(solution, solution.fit, reason=found.adopted.reason))
-    joint = joint_fit(solution, observations, found.joint.choices, prior, found.joint.fit.x)
-    return replace(found, adopted=adopted(solution, joint, found.adopted.reason))
+    by_formulas = formulas_log_bayes_factor(problem, found.joint, found.strongest_formula)
+    return replace(found, machine_break=broken if broken.log_bayes_factor > by_formulas else None)
 
 
 def _in_regimes(problem: Problem, families: Collection[str], found: SearchResult, least_cost: float) -> SearchResult:

@@ -8,10 +8,12 @@ from typing import Literal
 
 import numpy as np
 
+from calibration.effects.context import EffectContext
 from calibration.effects.library import library, parse_effects
 from calibration.gap.adoption import Adopted, adopt
 from calibration.gap.search import search
 from calibration.gap.search_result import Remaining, remaining
+from calibration.gap.unknown_inputs import filled_in, unknown_inputs, with_unknowns, without_unknowns
 from calibration.identification.checks import refuse_much_discarded
 from calibration.identification.refinement import Prior
 from calibration.identification.solve import Solution, solve
@@ -115,9 +117,21 @@ def _default(task: Task) -> Adopted:
         rest = find_effects(rig, observations, library(), prior, run, effects_rng(run.seed))
         return replace(rest.adopted, warnings=(*rest.adopted.warnings, *rest.warnings()))
     solution = solve(rig, observations, prior=prior, run=run.part(0.0, 0.8))
-    found = adopt(solution, observations, task.effects, prior=prior)
+    found = _requested(task, solution)
     refuse_much_discarded(solution.chain, solution.samples, found.solution.fit)
     return found
+
+
+def _requested(task: Task, solution: Solution) -> Adopted:
+    """Return the effects that a task names, with unknowns for samples that lack inputs of these effects."""
+    rows = filled_in(task.observations, solution.samples)
+    found = adopt(solution, rows, task.effects, prior=task.prior)
+    context = EffectContext(solution.chain, solution.fit.x, rows)
+    unknowns = unknown_inputs(found.effects, context, solution.samples)
+    if unknowns is None:
+        return found
+    given = with_unknowns(solution, unknowns, task.prior)
+    return without_unknowns(adopt(given, rows, task.effects, prior=task.prior), unknowns)
 
 
 def _pde_paper(task: Task) -> Adopted:

@@ -72,8 +72,8 @@ def grammar_of_residuals(problem: Problem, joint: JointFit, additions: EffectCol
     """
     solution, explained = problem.solution, problem
     if additions is not None:
-        chain = solution.chain
-        fit = refine(chain, solution.samples, solution.fit.x[: len(chain)], prior=problem.prior, additions=additions)
+        additions = along(solution, [additions])
+        fit = refine(solution.chain, solution.samples, solution.fit.x, prior=problem.prior, additions=additions)
         explained = replace(problem, solution=replace(solution, fit=fit, additions=additions))
     return Grammar(explained.project(explained.fit(joint.choices, explained.solution.fit.x)))
 

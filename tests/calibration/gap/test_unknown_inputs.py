@@ -1,0 +1,144 @@
+"""Where an input of an effect is unknown in some rows, the effect keeps its size, and nothing else is named for it."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from calibration.effects.columns import NO_JOINT, EffectColumns
+from calibration.effects.context import EffectContext
+from calibration.effects.fitted import Choice
+from calibration.effects.library import library
+from calibration.gap.unknown_inputs import filled_in, unknown_inputs
+from calibration.identification.samples import averaged
+from calibration.identification.solve import place
+from calibration.observations import Observations, parse_observations
+from calibration.pipeline.calibrate import identify
+from calibration.pipeline.find_gap import find_gap
+from daemon.rig_files import load_rig
+from tests.daemon.support.gap import session_csv
+
+SOURCE = load_rig("swdt82")
+WIDTH_RAD = 4e-3
+SLIPPED_DEG = 0.2  # the play moves the joint by at most 0.115 deg
+
+
+@functools.cache
+def session() -> Observations:
+    """80 poses of a boom with play at theta4, two prisms each."""
+    data = session_csv(80, 21, hidden=f"backlash@theta4:width_rad={WIDTH_RAD}")
+    return parse_observations(data, SOURCE.rig, "session.csv")
+
+
+def without(rows: Observations, lacking: NDArray[np.bool_], column: str = "theta4_dir") -> Observations:
+    values = np.where(lacking, np.nan, rows.extra[column])
+    return replace(rows, extra={**rows.extra, column: values})
+
+
+def named(rows: Observations, *families: str) -> dict[str, float]:
+    """Return the first coefficient of each effect that is found."""
+    found = find_gap(SOURCE.rig, SOURCE.text, rows, families=families or None)
+    return {f"{effect.family}@{effect.where}": effect.coefficients[0].value for effect in found.effects}
+
+
+def numbers() -> NDArray[np.intp]:
+    return np.arange(len(session()))
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    "lacking",
+    [(numbers() >= 30) & (numbers() < 60), numbers() >= 100, np.random.default_rng(21).random(160) < 0.25],
+    ids=["fifteen poses", "the last thirty poses", "a quarter at random"],
+)
+def test_play_is_named_alone_and_whole_where_its_direction_is_unknown_in_some_rows(lacking: NDArray[np.bool_]) -> None:
+    found = named(without(session(), lacking))
+    assert found == {"backlash@theta4": pytest.approx(WIDTH_RAD, rel=0.03)}
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("seed", [5, 11])
+def test_a_zero_that_slipped_where_the_direction_is_unknown_is_named_beside_the_play(seed: int) -> None:
+    data = session_csv(80, seed, hidden=f"backlash@theta4:width_rad={WIDTH_RAD}")
+    rows = parse_observations(data, SOURCE.rig, "session.csv")
+    slipped = np.arange(len(rows)) >= 100
+    theta4 = rows.joints["theta4"] + np.where(slipped, SLIPPED_DEG, 0.0)
+    moved = replace(rows, joints={**rows.joints, "theta4": theta4})
+    assert named(without(moved, slipped), "backlash", "zero_step") == {
+        "backlash@theta4": pytest.approx(WIDTH_RAD, rel=0.05),
+        "zero_step@theta4": pytest.approx(-np.radians(SLIPPED_DEG), rel=0.15),
+    }
+
+
+def test_an_effect_that_is_asked_for_by_name_keeps_its_size_where_its_input_is_unknown() -> None:
+    rows = without(session(), numbers() >= 100)
+    model = identify(SOURCE.rig, SOURCE.text, rows, effects="backlash@theta4")
+    (effect,) = model.effects
+    assert effect.coefficients[0].value == pytest.approx(WIDTH_RAD, rel=0.03)
+    assert abs(effect.coefficients[0].value - WIDTH_RAD) < 3.0 * effect.coefficients[0].standard_error
+    assert len(model.covariance) == len(model.chain) + 1  # the model has no unknowns of its training rows
+    assert len(model.fitted_rows) == len(rows)
+
+
+def unknowns(family: str, where: str, value: float, rows: Observations) -> EffectColumns | None:
+    """Return the unknowns of rows of which each is a sample, for one effect of a given size."""
+    chain, _, start = place(SOURCE.rig, rows)
+    context = EffectContext(chain, start.x, rows)
+    settings = library()[family].variants(context, where)[0]
+    effect = Choice(family, where, settings).fitted(context, np.array([value]), np.array([1e-5]))
+    return unknown_inputs([effect], context, averaged(chain, rows))
+
+
+def test_each_run_of_samples_has_an_unknown_of_the_play_s_size_in_common_and_one_of_its_own_for_each() -> None:
+    lacking = np.isin(numbers(), (30, 31, 32, 50))
+    found = unknowns("backlash", "theta4", WIDTH_RAD, without(session(), lacking))
+    assert found is not None
+    ran = [np.flatnonzero(own).tolist() for own in found.column.T]
+    assert ran == [[30, 31, 32], [30], [31], [32], [50]]
+    assert set(found.joint.tolist()) == {SOURCE.rig.joint_names.index("theta4")}
+    assert found.prior_sigma == pytest.approx(np.full(5, np.degrees(WIDTH_RAD / 2)))
+    assert unknowns("backlash", "theta4", WIDTH_RAD, session()) is None
+
+
+def test_a_run_ends_with_its_session() -> None:
+    rows = without(session(), np.isin(numbers(), (30, 31)))
+    found = unknowns("backlash", "theta4", WIDTH_RAD, replace(rows, session=np.where(numbers() < 31, "one", "two")))
+    assert found is not None
+    assert [np.flatnonzero(own).tolist() for own in found.column.T] == [[30], [31]]
+
+
+def test_thousands_of_samples_without_an_input_have_no_more_than_a_few_hundred_unknowns() -> None:
+    rows = session().select(np.tile(numbers(), 5))
+    moved = rows.position_mm + 1e-3 * np.repeat(np.arange(5), len(session()))[:, None]  # so that none is a copy
+    many = replace(rows, position_mm=moved, pose=np.arange(len(rows)).astype(str))
+    found = unknowns("backlash", "theta4", WIDTH_RAD, without(many, np.arange(len(rows)) >= 300))
+    assert found is not None
+    assert 150 < len(found) <= 201
+    assert (found.column.sum(axis=1) == np.where(np.arange(len(rows)) >= 300, 2.0, 0.0)).all()
+
+
+def test_an_effect_on_the_prisms_has_unknowns_along_all_axes() -> None:
+    warm = replace(session(), extra={**session().extra, "temperature_degC": 5.0 + numbers() / 10.0})
+    found = unknowns("thermal_expansion", "boom", 12e-6, without(warm, numbers() == 40, "temperature_degC"))
+    assert found is not None
+    assert found.shift_mm is not None
+    assert set(found.joint.tolist()) == {NO_JOINT}
+    assert found.shift_mm[40].tolist() == np.eye(3).tolist()
+    assert not np.delete(found.shift_mm, 40, axis=0).any()
+    assert (found.prior_sigma > 0.0).all()
+
+
+def test_rows_of_a_standstill_share_its_inputs_but_not_its_rates() -> None:
+    rows = session().select(np.repeat(numbers(), 2))
+    again = replace(rows, position_mm=rows.position_mm + 1e-3 * (np.arange(len(rows)) % 2)[:, None])
+    odd = np.arange(len(rows)) % 2 == 1
+    samples = averaged(place(SOURCE.rig, again)[0], again)
+    given = without(again, odd)
+    rates = np.where(odd, np.nan, 1.0)
+    full = filled_in(replace(given, extra={**given.extra, "theta4_rate": rates}), samples)
+    assert full.extra["theta4_dir"].tolist() == again.extra["theta4_dir"].tolist()
+    np.testing.assert_array_equal(full.extra["theta4_rate"], rates)
