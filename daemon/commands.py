@@ -15,6 +15,7 @@ FAILED, WRONG_USE, REFUSED = 1, 2, 3
 CHECK = "check"
 SESSION_KINDS = ("single_joint", "multi_joint", "static_poses", CHECK)
 HOW_TO_END = "stop or abort it first: `rigcal session stop`, or `rigcal session abort` if it is unusable"
+NO_POSE = "no pose of it can be used"  # reason why a session is not used that no operator can overrule
 OTHER_RIG_FILE = "it was recorded with another rig file: "  # beginning of the reason why a session is not used
 HOW_TO_READ_AGAIN = "to read its captures with this one, `rigcal session export` it, and `rigcal replay` the files"
 LOOK_S = 0.5  # how often a command that waits checks whether its caller is still connected

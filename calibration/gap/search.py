@@ -37,6 +37,7 @@ from calibration.gap.unknown_inputs import (
     implausible_unknowns,
     unknown_inputs,
     with_unknowns,
+    with_warning,
     without_unknowns,
 )
 from calibration.identification.reading_steps import in_true_steps
@@ -46,7 +47,7 @@ from calibration.observations import Observations
 
 _REGIME = 15.0  # log Bayes factor required of an effect in a part of the data, as variable and border are selected
 _MOST_REPEATS = 5  # of the search, as effects that lack inputs in some rows may be found with unknowns for others
-_CONTRADICTION = 15.0  # nats that an unknown larger than its effect can be counts against it
+_CONTRADICTION = 30.0  # nats that an unknown larger than its effect can be counts against it
 _LEAST_SAMPLES = 60  # with fewer samples, the evidence of a background may come from a few fixes
 
 
@@ -73,11 +74,12 @@ def search(
     if seen is not solution:
         # The model uses the reading noise of its rig file, and counts additional noise as scatter.
         given = solution if unknowns is None else with_unknowns(solution, unknowns, prior)
-        outcome = Adopted(given, given.fit, reason=found.adopted.reason)
+        before = found.adopted
+        outcome = Adopted(given, given.fit, reason=before.reason)
         if found.joint.choices:
             joint = joint_fit(given, observations, found.joint.choices, prior, found.joint.fit.x)
-            outcome = adopted(given, joint, found.adopted.reason)
-        found = replace(found, adopted=outcome)
+            outcome = adopted(given, joint, before.reason)
+        found = replace(found, adopted=replace(outcome, warnings=before.warnings, structured=before.structured))
     return found if unknowns is None else replace(found, adopted=without_unknowns(found.adopted, unknowns))
 
 
@@ -89,18 +91,25 @@ def _with_unknowns(problem: Problem, families: Collection[str]) -> tuple[SearchR
     """
     solution, samples = problem.solution, problem.solution.samples
     first = found = _search(problem, families)
-    effects, unknowns, implausible = _lack_inputs(found) or _may_lack_inputs(found), None, set[str]()
+    effects, unknowns = _lack_inputs(found) or _may_lack_inputs(found), None
     for _ in range(_MOST_REPEATS):
-        lacking = unknown_inputs(effects, found.joint.context, samples, implausible)
+        lacking = unknown_inputs(effects, found.joint.context, samples)
         if lacking is None or (unknowns is not None and lacking.names == unknowns.names):
             break
-        tried = _search(replace(problem, solution=with_unknowns(solution, lacking, problem.prior)), families)
-        if implausible and not _names_more(tried, found):
-            break
-        found, unknowns = tried, lacking
+        unknowns = lacking
+        found = _search(replace(problem, solution=with_unknowns(solution, unknowns, problem.prior)), families)
         effects = _lack_inputs(found)
-        implausible |= set(implausible_unknowns(found.joint, unknowns))
-    return (found, unknowns) if unknowns is not None and effects else (first, None)
+    if unknowns is None or not effects:
+        return first, None
+    implausible = implausible_unknowns(found.joint, unknowns)
+    if not len(implausible):
+        return found, unknowns
+    fewer = unknown_inputs(effects, found.joint.context, samples, implausible.names)
+    if fewer is not None:
+        tried = _search(replace(problem, solution=with_unknowns(solution, fewer, problem.prior)), families)
+        if _names_more(tried, found, len(implausible)):
+            return tried, fewer
+    return replace(found, adopted=with_warning(found.adopted, effects, implausible, samples)), unknowns
 
 
 def _lack_inputs(found: SearchResult) -> list[FittedEffect]:
@@ -117,10 +126,10 @@ def _may_lack_inputs(found: SearchResult) -> list[FittedEffect]:
     return [effect for effect in effects if unknown_inputs([effect], context, samples) is not None][:1]
 
 
-def _names_more(tried: SearchResult, found: SearchResult) -> bool:
-    """Return True if a result has all names of another and a further one, and explains the samples about as well."""
+def _names_more(tried: SearchResult, found: SearchResult, fewer: int) -> bool:
+    """Return True if a result with fewer unknowns has all names of another and a further one, and is as probable."""
     names, known = (set(map(str, one.joint.choices)) for one in (tried, found))
-    return names > known and tried.joint.fit.cost < found.joint.fit.cost + _CONTRADICTION
+    return names > known and tried.joint.fit.cost < found.joint.fit.cost + fewer * _CONTRADICTION
 
 
 def _search(problem: Problem, families: Collection[str]) -> SearchResult:

@@ -326,8 +326,8 @@ class Remaining:
 
     @property
     def adopted(self) -> Adopted:
-        """Kinematics and effects of the search, with `structured` set."""
-        return replace(self.found.adopted, structured=self.significant)
+        """Kinematics and effects of the search; `structured` also if the remaining errors are significant."""
+        return replace(self.found.adopted, structured=self.significant or self.found.adopted.structured)
 
     def warnings(self) -> Iterator[str]:
         """Yield sentences about existing effects that the model lacks, or may have at the wrong place."""

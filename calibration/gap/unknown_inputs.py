@@ -8,7 +8,7 @@ have unknown displacements of the effect's usual size in the fit.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from itertools import compress
 
@@ -28,6 +28,7 @@ from calibration.observations import Floats, Observations, Strings
 _MOST_PIECES = 200  # of the samples that lack inputs of effects at one joint; more make the fit slow
 _LARGEST = 1.5  # prior sigmas; the usual effect, such as half the width of a play, is one
 _CHANCE = 2.0  # standard errors
+_PART = "part "  # in the name of an unknown of a part of a run
 
 
 def filled_in(observations: Observations, samples: Samples) -> Observations:
@@ -81,8 +82,8 @@ def unknown_inputs(
     return found if len(found) else None
 
 
-def implausible_unknowns(joint: JointFit, unknowns: EffectColumns) -> tuple[str, ...]:
-    """Return the names of unknowns that are larger than the effects can be, so that there must be another cause.
+def implausible_unknowns(joint: JointFit, unknowns: EffectColumns) -> EffectColumns:
+    """Return the unknowns of whole runs that are larger than the effects can be, so there must be another cause.
 
     Args:
         joint: a fit with these unknowns.
@@ -92,17 +93,18 @@ def implausible_unknowns(joint: JointFit, unknowns: EffectColumns) -> tuple[str,
     own = slice(first, first + len(unknowns))
     value, error = np.abs(joint.fit.x[own]), np.sqrt(np.diag(joint.fit.covariance)[own])
     beyond = value > _LARGEST * unknowns.prior_sigma + _CHANCE * error
-    return tuple(name for name, is_beyond in zip(unknowns.names, beyond, strict=True) if is_beyond)
+    beyond &= [_PART not in name for name in unknowns.names]  # a single sample that is off is an outlier
+    return _only(unknowns, beyond)
 
 
 def _at_joint(name: str, number: int, variance: Floats, session: Strings) -> EffectColumns:
     """Return the unknowns of one joint; `variance` (m,) is positive in the samples that have them."""
     pieces = _pieces(variance > 0.0, session)
     return EffectColumns(
-        tuple(f"unknown@{name}:{piece[0]}-{piece[-1]}" for piece in pieces),
+        tuple(f"unknown@{name}:{piece}" for piece in pieces),
         np.full(len(pieces), number),
         _indicators(pieces, len(variance)),
-        np.array([math.sqrt(variance[piece].mean()) for piece in pieces]),
+        np.array([math.sqrt(variance[own].mean()) for own in pieces.values()]),
     )
 
 
@@ -111,10 +113,10 @@ def _at_prisms(variance: Floats, session: Strings) -> EffectColumns:
     pieces = _pieces(variance > 0.0, session)
     is_here = _indicators(pieces, len(variance))
     return EffectColumns(
-        tuple(f"unknown@prism:{axis}{piece[0]}-{piece[-1]}" for axis in "xyz" for piece in pieces),
+        tuple(f"unknown@prism:{axis} {piece}" for axis in "xyz" for piece in pieces),
         np.full(3 * len(pieces), NO_JOINT),
         np.zeros((len(variance), 3 * len(pieces))),
-        np.array([math.sqrt(variance[piece].mean()) for _ in "xyz" for piece in pieces]),
+        np.array([math.sqrt(variance[own].mean()) for _ in "xyz" for own in pieces.values()]),
         np.stack([np.kron(axis, is_here) for axis in np.eye(3)], axis=1),
     )
 
@@ -129,25 +131,49 @@ def _only(every: EffectColumns, kept: NDArray[np.bool_]) -> EffectColumns:
     )
 
 
-def _pieces(lacks: NDArray[np.bool_], session: Strings) -> list[Integers]:
-    """Return runs of consecutive samples of a session that lack an input, and the parts of each run."""
+def _pieces(lacks: NDArray[np.bool_], session: Strings) -> dict[str, Integers]:
+    """Return runs of consecutive samples of a session that lack an input, and the parts of each run, by name."""
     found = np.flatnonzero(lacks)
+    if not len(found):
+        return {}
     starts = np.flatnonzero((np.diff(found) > 1) | (session[found[1:]] != session[found[:-1]])) + 1
     length = math.ceil(len(found) / _MOST_PIECES)
-    pieces = []
+    pieces = {}
     for run in np.split(found, starts):
-        pieces.append(run)
+        pieces[f"{run[0]}-{run[-1]}"] = run
         if len(run) > length:
-            pieces += np.split(run, range(length, len(run), length))
-    return pieces if len(found) else []
+            pieces |= {f"{_PART}{own[0]}-{own[-1]}": own for own in np.split(run, range(length, len(run), length))}
+    return pieces
 
 
-def _indicators(pieces: Sequence[Integers], samples: int) -> Floats:
+def _indicators(pieces: Mapping[str, Integers], samples: int) -> Floats:
     """Return (m, k): 1 in the samples of each piece, else 0."""
     out = np.zeros((samples, len(pieces)))
-    for number, piece in enumerate(pieces):
-        out[piece, number] = 1.0
+    for number, own in enumerate(pieces.values()):
+        out[own, number] = 1.0
     return out
+
+
+def with_warning(
+    found: Adopted, effects: Sequence[FittedEffect], implausible: EffectColumns, samples: Samples
+) -> Adopted:
+    """Return a result with a warning of errors that lacking inputs do not explain, which count as structure.
+
+    Args:
+        found: the result.
+        effects: effects whose inputs are lacking.
+        implausible: result of `implausible_unknowns`.
+        samples: of the fit.
+    """
+    moved = implausible.column.any(axis=1)
+    if implausible.shift_mm is not None:
+        moved |= implausible.shift_mm.any(axis=(1, 2))
+    named = ", ".join(f"{effect.family}@{effect.where}" for effect in effects)
+    told = (
+        f"{samples.fixes[moved].sum():.0f} fixes that lack inputs of {named} have larger errors than that can cause: "
+        "something else differs in just these fixes, such as the zero of a joint"
+    )
+    return replace(found, warnings=(*found.warnings, told), structured=True)
 
 
 def with_unknowns(solution: Solution, unknowns: EffectColumns, prior: Prior) -> Solution:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from daemon.commands import HOW_TO_READ_AGAIN, OTHER_RIG_FILE
+from daemon.commands import HOW_TO_READ_AGAIN, NO_POSE, OTHER_RIG_FILE
 
 INTERVAL_SIGMAS = 2.0  # standard errors of a 95 % interval
 DASH = "\N{EN DASH}"
@@ -109,6 +109,9 @@ def not_used(session_id: str, reason: str) -> str:
         session_id: the session.
         reason: why it is not used, a clause.
     """
-    accept = f"to use it anyway: `rigcal session accept {session_id}`"
-    remedy = HOW_TO_READ_AGAIN if reason.startswith(OTHER_RIG_FILE) else accept
+    remedy = f"to use it anyway: `rigcal session accept {session_id}`"
+    if reason.startswith(OTHER_RIG_FILE):
+        remedy = HOW_TO_READ_AGAIN
+    elif NO_POSE in reason:
+        remedy = "hold another one"
     return f"calibration does not use this session: {reason}; {remedy}"

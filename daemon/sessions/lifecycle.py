@@ -19,7 +19,7 @@ from typing import Any
 
 from calibration.rig.decoding import without_decoding
 from calibration.rig.description import Rig
-from daemon.commands import HOW_TO_READ_AGAIN, OTHER_RIG_FILE, REFUSED, CommandError, caller_columns
+from daemon.commands import HOW_TO_READ_AGAIN, NO_POSE, OTHER_RIG_FILE, REFUSED, CommandError, caller_columns
 from daemon.host.time_service import ClockState
 from daemon.rig_files import misreading
 from daemon.sessions.open_session import CONSTANT_TOLERANCE_MM, OpenSession
@@ -27,7 +27,7 @@ from daemon.store.connection import rig_sha256
 from daemon.store.queries.jobs import JobTable
 from daemon.store.queries.models import ModelTable
 from daemon.store.queries.observations import first_constants_mm, stations_of
-from daemon.store.queries.poses import has_poses_before_enclosed, is_enclosed
+from daemon.store.queries.poses import has_poses, has_poses_before_enclosed, is_enclosed
 from daemon.store.queries.sessions import (
     OPEN_AT_NEXT,
     OPEN_IN_BACKUP,
@@ -263,6 +263,8 @@ class SessionLifecycle:
                 raise CommandError(f"session {session_id!r} is already used by calibration; there is nothing to accept")
             if despite.startswith(OTHER_RIG_FILE):
                 raise CommandError(f"session {session_id!r}: {despite}; {HOW_TO_READ_AGAIN}", REFUSED)
+            if not has_poses(self._store, session_id):
+                raise CommandError(f"session {session_id!r}: {NO_POSE}, so there is nothing to accept", REFUSED)
             self._decide(session_id, operator, "accepted", instead_of="rejected")
             self._models.forget_drift(session_id)
             told = {"accepted_despite": despite, "accepted_after_job": self._jobs.newest_id()}
@@ -355,6 +357,8 @@ class SessionLifecycle:
             return (
                 f"control point {again[0]} was {again[1]:.1f} mm off when it was shot again, so the station had moved"
             )
+        if not has_poses(self._store, session_id):
+            return NO_POSE
         if not self.table.points_shot(session_id, "start") & self.table.points_shot(session_id, "end"):
             return NOT_SHOT
         if has_poses_before_enclosed(self._store, session_id):

@@ -22,6 +22,11 @@ POSES = """SELECT DISTINCT coalesce(pose, id) AS pose FROM observations WHERE se
     AND (boot_id, monotonic_ns) >= (?, ?) AND (boot_id, monotonic_ns) < (?, ?) LIMIT ?"""
 
 
+def has_poses(source: RowSource, session_id: str) -> bool:
+    """Return True if a session has a pose that can be used."""
+    return bool(_poses(source, session_id, (_FIRST, _LAST), 1))
+
+
 def has_poses_before_enclosed(source: RowSource, session_id: str) -> bool:
     """Return True if a pose follows the first shot but precedes all shots of points shot again at the end."""
     first = min(_shots(source, session_id, "start").values())

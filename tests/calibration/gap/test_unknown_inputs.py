@@ -74,6 +74,19 @@ def test_a_zero_that_slipped_where_the_direction_is_unknown_is_named_beside_the_
     }
 
 
+@pytest.mark.long
+def test_errors_that_lacking_directions_cannot_explain_and_that_get_no_name_are_reported() -> None:
+    """The joint is off in just these poses, and not in later ones: the library has no such effect."""
+    off = (numbers() >= 30) & (numbers() < 60)
+    theta4 = session().joints["theta4"] + np.where(off, 3.0 * SLIPPED_DEG, 0.0)
+    rows = without(replace(session(), joints={**session().joints, "theta4": theta4}), off)
+    found = find_gap(SOURCE.rig, SOURCE.text, rows, families=("backlash", "zero_step"))
+    assert [str(effect.where) for effect in found.effects] == ["theta4"]
+    assert found.warnings[0].startswith(
+        "30 fixes that lack inputs of backlash@theta4 have larger errors than that can cause"
+    )
+
+
 def test_an_effect_that_is_asked_for_by_name_keeps_its_size_where_its_input_is_unknown() -> None:
     rows = without(session(), numbers() >= 100)
     model = identify(SOURCE.rig, SOURCE.text, rows, effects="backlash@theta4")

@@ -109,6 +109,18 @@ def test_a_session_without_control_shots_is_stored_and_shown_and_nothing_trains_
     assert all(name not in (*order.session_ids, *order.train_ids) for order in orders)
 
 
+def test_a_session_without_a_pose_says_so_and_cannot_be_accepted(session_rig: Rig) -> None:
+    """It would train on no data; whether its control points were shot makes no difference."""
+    session_rig.say("start", prism="r")
+    session_rig.shoot("cp1", CP1)
+    session_rig.shoot("cp1", CP1)
+    stopped = session_rig.say("stop")
+    assert stopped["not_used"] == "no pose of it can be used"
+    with pytest.raises(CommandError, match="no pose of it can be used, so there is nothing to accept"):
+        session_rig.say("accept", id=stopped["id"])
+    assert Jobs(session_rig).due() == []
+
+
 @pytest.mark.parametrize(
     ("start", "end", "why"),
     [
