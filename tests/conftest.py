@@ -23,6 +23,7 @@ COUNTED = (
     "tests/golden/",
     "tests/daemon/store/",
     "tests/daemon/acquisition/test_redecoding.py",
+    "tests/daemon/models/test_comparisons.py",
     "tests/daemon/models/test_registry.py",
     "tests/daemon/sessions/test_session_store_order.py",
     "tests/daemon/sessions/test_sessions.py",

@@ -12,10 +12,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 
 from calibration.observations import parse_observations
 from calibration.pipeline.calibrate import identify
 from calibration.rig.description import Rig
+from daemon.commands import WRONG_USE, CommandError
 from daemon.composition import joiner
 from daemon.config.config import Config
 from daemon.jobs.job_queue import JobQueue
@@ -25,6 +27,7 @@ from daemon.models.live_model import LiveModel, Loaded, Missing
 from daemon.models.live_tip import FRESH_S, LiveTip
 from daemon.models.model_files import model_sha256, write_model
 from daemon.models.registry import ModelRegistry
+from daemon.store.errors import NotInStoreError
 from daemon.store.queries.models import ModelTable
 from drivers.clock import Stamp
 from drivers.readings import Reading, Record, Status
@@ -159,3 +162,21 @@ def pose(seed: int) -> dict[str, float]:
     """Joint values well inside the limits."""
     rng = np.random.default_rng(seed)
     return {j.name: float(j.limits[0] + rng.uniform(0.2, 0.8) * (j.limits[1] - j.limits[0])) for j in SOURCE.rig.joints}
+
+
+def states(rig: ModelRig) -> dict[int, str]:
+    """The state of each model by its number."""
+    return {model.id: model.state for model in rig.models.all()}
+
+
+def refusal(command: object, status: int, **arguments: object) -> str:
+    """What a command says that refuses with an exit status."""
+    with pytest.raises((CommandError, NotInStoreError)) as caught:
+        command(arguments)  # type: ignore[operator]  # any of the registry's commands
+    assert getattr(caught.value, "status", WRONG_USE) == status
+    return str(caught.value)
+
+
+def measured(rig: ModelRig, name: str, poses: int, kind: str = "static_poses") -> None:
+    """Store a session of so many poses at which all prisms of the model were measured."""
+    rig.jobs.measured(name, poses, kind, prisms=PRISMS)
