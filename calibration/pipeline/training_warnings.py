@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from calibration.effects.fitted import missing_inputs
 from calibration.effects.library import library
 from calibration.identification.reading_steps import rounding
 from calibration.identification.solve import Solution
@@ -39,6 +40,7 @@ def training_warnings(model: CalibratedModel, observations: Observations, soluti
     """
     yield from solution.warnings
     context = Predictor.of(model).context(observations)
+    yield from missing_inputs(model.effects, context)
     yield from torque_unit_warnings(times_computed(context))
     rounding_mm, rounded = rounding(context, model.effects_noise_mm)
     if rounded:

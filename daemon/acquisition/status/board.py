@@ -113,7 +113,7 @@ class StatusBoard:
             for event in events:
                 if event.device in self._channels:
                     self._event_count += 1
-                    self._events[_place(event)] = self._event_count, event
+                    self._events[self._place(event)] = self._event_count, event
 
     def captured(self, captures: Sequence[Capture]) -> None:
         """Count captures that have just been stored, by link, and note how long the oldest one has waited."""
@@ -172,10 +172,18 @@ class StatusBoard:
             if gap.reason is GapReason.FRAMES_LOST:
                 self._lately_missed.add(gap.channel, gap.missed or 0)
 
+    def _place(self, event: DeviceEvent) -> tuple[str, str, bool]:
+        """Return the key of the events that this event replaces.
+
+        What a device reports, and what rigcal says about it, are kept apart. All events of a link are rigcal's own.
+        """
+        is_kept_apart = event.kind in (EventKind.ALARM, EventKind.WARNING) and event.device not in self._links
+        return event.device, event.kind, is_kept_apart and event.code is None
+
     def _happened(self, event: DeviceEvent) -> None:
         self._event_count += 1
         self._event_counts[event.device, event.kind.value] += 1
-        self._events[_place(event)] = self._event_count, event
+        self._events[self._place(event)] = self._event_count, event
         if event.kind in (EventKind.LINK_UP, EventKind.LINK_LOST):
             link = self._links.setdefault(event.device, _Link(event.stamp))
             is_up = event.kind is EventKind.LINK_UP
@@ -355,11 +363,6 @@ class StatusBoard:
             restarted_age_s=None if link.restarted_at is None else _age_s(link.restarted_at, now),
             decoder_failed_age_s=None if decoder_failed is None else _age_s(decoder_failed, now),
         )
-
-
-def _place(event: DeviceEvent) -> tuple[str, str, bool]:
-    """Return the key of the events that this event replaces: what a device reports, and what rigcal says about it."""
-    return event.device, event.kind, event.kind in (EventKind.ALARM, EventKind.WARNING) and event.code is None
 
 
 def _age_s(stamp: Stamp, now: Stamp) -> float:

@@ -95,6 +95,7 @@ def test_an_effect_that_is_asked_for_by_name_keeps_its_size_where_its_input_is_u
     assert abs(effect.coefficients[0].value - WIDTH_RAD) < 3.0 * effect.coefficients[0].standard_error
     assert len(model.covariance) == len(model.chain) + 1  # the model has no unknowns of its training rows
     assert len(model.fitted_rows) == len(rows)
+    assert "backlash@theta4 is left out in 60 of 160 rows: this data lacks the column theta4_dir" in model.warnings
 
 
 def unknowns(family: str, where: str, value: float, rows: Observations) -> EffectColumns | None:

@@ -17,6 +17,7 @@ from daemon.alarms.library import library
 from daemon.cli.diagnosis import channel_findings
 from drivers.can.raw_signal import BitField, SignalChannel, SignalDecoder
 from drivers.can_decoder import CanDecoder
+from drivers.can_link import QUEUE_FULL
 from drivers.canopen.cia406 import EncoderChannel, EncoderDecoder
 from drivers.canopen.node_setup import PROFILE_ENCODER, NodeSetup, SetupRunner
 from drivers.canopen.pdo import TransmitPdo
@@ -71,12 +72,12 @@ class Joint:
     def status(self) -> AcquisitionStatus:
         return self._board.snapshot(self._intakes, [self._decoder.summary(self.clock.now())])
 
-    def found(self) -> list[Alarm]:
+    def found(self, subject: str = "theta1") -> list[Alarm]:
         evidence = Evidence(self.clock.now(), 100.0, acquisition=self.status())
-        return [alarm for rule in library() for alarm in rule(evidence) if alarm.subject == "theta1"]
+        return [alarm for rule in library() for alarm in rule(evidence) if alarm.subject == subject]
 
-    def alarms(self) -> set[str]:
-        return {alarm.kind for alarm in self.found()}
+    def alarms(self, subject: str = "theta1") -> set[str]:
+        return {alarm.kind for alarm in self.found(subject)}
 
 
 def test_a_set_up_that_failed_and_was_repeated_hides_no_alarm_of_the_device() -> None:
@@ -103,6 +104,18 @@ def test_a_set_up_that_failed_and_was_repeated_hides_no_alarm_of_the_device() ->
     assert joint.alarms() == {"device_alarm"}
     hear(0)
     assert joint.alarms() == set()
+
+
+def test_the_warning_of_a_full_transmit_queue_ends_when_the_link_withdraws_it() -> None:
+    joint = Joint(EncoderDecoder(EncoderChannel(name="theta1", node=5, pdo=PDO, heartbeat_ms=0)))
+    joint.open_link()
+    for _ in range(2):
+        joint.clock.advance(1.0)
+        joint.record([DeviceEvent("boom", joint.clock.now(), EventKind.WARNING, f"boom: {QUEUE_FULL}")])
+        assert "device_warning" in joint.alarms("boom")
+        joint.clock.advance(1.0)
+        joint.record([DeviceEvent("boom", joint.clock.now(), EventKind.WARNING, "boom: 5 frames were not sent", 0)])
+        assert "device_warning" not in joint.alarms("boom")
 
 
 POSITION = "185 00 40 00 00 00 00"
