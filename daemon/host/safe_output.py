@@ -84,5 +84,8 @@ def write_file(path: Path, data: bytes) -> None:
             file.flush()
             os.fsync(file.fileno())
         scratch.replace(path)
+    except OSError as error:
+        error.filename = str(path)  # a write of data names no file
+        raise
     finally:
         scratch.unlink(missing_ok=True)
