@@ -34,7 +34,7 @@ class SessionAdvice:
             advice.append(
                 f"shoot {which} before the first pose (`rigcal session shoot NAME`), and again before the end"
             )
-        advice += self._doubts(session)
+        advice += self._doubts(session, is_open=True)
         return [
             *advice,
             "stand still at every pose until `rigcal status` counts it; move all joints through their ranges",
@@ -47,7 +47,7 @@ class SessionAdvice:
         if missing or not points:
             which = ", ".join(missing) or "none was shot in this session"
             advice.append(f"control points not shot at the session's end: {which}")
-        advice += self._doubts(session)
+        advice += self._doubts(session, is_open=False)
         summary = self._table.summary(session.id)
         if session.kind == CHECK and not CHECK_POSES[0] <= summary["poses"] <= CHECK_POSES[1]:
             least, most = CHECK_POSES
@@ -65,8 +65,13 @@ class SessionAdvice:
         points, shot = self._setups.control_point_names(session.setup_id), self._table.points_shot(session.id, phase)
         return points, [name for name in points if name not in shot]
 
-    def _doubts(self, session: OpenSession) -> list[str]:
-        """Return a sentence for each joint that has jumped, and for each station that may be on another prism."""
+    def _doubts(self, session: OpenSession, *, is_open: bool) -> list[str]:
+        """Return a sentence for each joint that has jumped, and for each station that may be on another prism.
+
+        Args:
+            session: the session.
+            is_open: whether the operator can still confirm that the station is on the prism.
+        """
         jumps = [
             f"{joint} jumped during the session, and no fix after the jump is used: if its encoder was preset, start a "
             "new session"
@@ -74,7 +79,7 @@ class SessionAdvice:
             if joint in session.jumped
         ]
         return jumps + [
-            f"{suspicion.reason}; fixes since then are not used: {suspicion.remedy}"
+            f"{suspicion.reason}; fixes since then are not used{f': {suspicion.remedy}' if is_open else ''}"
             for suspicion in self._prisms.suspicions(session)
         ]
 

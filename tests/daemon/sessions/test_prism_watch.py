@@ -77,7 +77,8 @@ def test_another_prism_s_fixes_never_become_observations_however_long_it_is_foll
     assert suspicion["distance_m"] == pytest.approx(10.0)
     assert "confirm-prism" in suspicion["remedy"]
     assert [s.station for s in rig.keeper.prism_suspicions()] == ["station"]
-    assert any("perhaps another prism" in sentence for sentence in rig.say("stop")["advice"])
+    (told,) = [sentence for sentence in rig.say("stop")["advice"] if "perhaps another prism" in sentence]
+    assert "confirm-prism" not in told, "a closed session takes no confirmation"
     assert rig.keeper.prism_suspicions() == []
 
 
