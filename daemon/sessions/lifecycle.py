@@ -263,8 +263,6 @@ class SessionLifecycle:
                 raise CommandError(f"session {session_id!r} is already used by calibration; there is nothing to accept")
             if despite.startswith(OTHER_RIG_FILE):
                 raise CommandError(f"session {session_id!r}: {despite}; {HOW_TO_READ_AGAIN}", REFUSED)
-            if not has_poses(self._store, session_id):
-                raise CommandError(f"session {session_id!r}: {NO_POSE}, so there is nothing to accept", REFUSED)
             self._decide(session_id, operator, "accepted", instead_of="rejected")
             self._models.forget_drift(session_id)
             told = {"accepted_despite": despite, "accepted_after_job": self._jobs.newest_id()}
@@ -357,10 +355,10 @@ class SessionLifecycle:
             return (
                 f"control point {again[0]} was {again[1]:.1f} mm off when it was shot again, so the station had moved"
             )
-        if not has_poses(self._store, session_id):
-            return NO_POSE
-        if not self.table.points_shot(session_id, "start") & self.table.points_shot(session_id, "end"):
-            return NOT_SHOT
+        at_start, at_end = (self.table.points_shot(session_id, phase) for phase in ("start", "end"))
+        if not at_start & at_end:
+            # Without a pose, all shots are of the start.
+            return NO_POSE if at_start and not has_poses(self._store, session_id) else NOT_SHOT
         if has_poses_before_enclosed(self._store, session_id):
             return NOT_THE_SAME
         return None if is_enclosed(self._store, session_id, LEAST_ENCLOSED) else NOT_ENCLOSED

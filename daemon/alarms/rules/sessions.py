@@ -61,11 +61,11 @@ def gain_meter_hangs(evidence: Evidence) -> Iterator[Finding]:
 
 @rule(
     "warning",
-    "Hold a new session with control shots at its start and end; or accept this one, if it has poses, with "
+    "Hold a new session with control shots at its start and end, or accept this one with "
     "`rigcal session accept SUBJECT`.",
 )
 def session_not_trained(evidence: Evidence) -> Iterator[Finding]:
-    """Calibration does not use a closed session: it has no poses or control shots, or the station moved.
+    """Calibration does not use a closed session: control shots are missing at its start or end, or the station moved.
 
     Cleared when an operator accepts or rejects the session, or when a newer session is used.
     """
