@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from calibration.effects.columns import EffectColumns
 from calibration.effects.fitted import FittedEffect
 from calibration.gap.adoption import Adopted, adopted
 from calibration.gap.background.blocks import displacement_blocks, possible_blocks, smooth_blocks, time_blocks
@@ -33,8 +32,9 @@ from calibration.gap.screening import by_family
 from calibration.gap.search_result import STRUCTURE, SearchResult
 from calibration.gap.stepwise.search import MANY_OUTLIERS, StepwiseSearch
 from calibration.gap.unknown_inputs import (
+    Unknowns,
     filled_in,
-    implausible_unknowns,
+    implausible_runs,
     unknown_inputs,
     with_unknowns,
     with_warning,
@@ -80,10 +80,12 @@ def search(
             joint = joint_fit(given, observations, found.joint.choices, prior, found.joint.fit.x)
             outcome = adopted(given, joint, before.reason)
         found = replace(found, adopted=replace(outcome, warnings=before.warnings, structured=before.structured))
-    return found if unknowns is None else replace(found, adopted=without_unknowns(found.adopted, unknowns))
+    if unknowns is None:
+        return found
+    return replace(found, adopted=without_unknowns(found.adopted, solution.samples, unknowns))
 
 
-def _with_unknowns(problem: Problem, families: Collection[str]) -> tuple[SearchResult, EffectColumns | None]:
+def _with_unknowns(problem: Problem, families: Collection[str]) -> tuple[SearchResult, Unknowns | None]:
     """Return the effects that the data require, and the unknowns of samples that lack inputs of these effects.
 
     The search is repeated with these unknowns. An unknown that is larger than its effect can be has another cause: if
@@ -94,14 +96,14 @@ def _with_unknowns(problem: Problem, families: Collection[str]) -> tuple[SearchR
     effects, unknowns = _lack_inputs(found) or _may_lack_inputs(found), None
     for _ in range(_MOST_REPEATS):
         lacking = unknown_inputs(effects, found.joint.context, samples)
-        if lacking is None or (unknowns is not None and lacking.names == unknowns.names):
+        if lacking is None or lacking.is_like(unknowns):
             break
         unknowns = lacking
         found = _search(replace(problem, solution=with_unknowns(solution, unknowns, problem.prior)), families)
         effects = _lack_inputs(found)
     if unknowns is None or not effects:
         return first, None
-    implausible = implausible_unknowns(found.joint, unknowns)
+    implausible = implausible_runs(found.joint, unknowns)
     if not len(implausible):
         return found, unknowns
     fewer = unknown_inputs(effects, found.joint.context, samples, implausible.names)

@@ -8,8 +8,8 @@ have unknown displacements of the effect's usual size in the fit.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
 from itertools import compress
 
 import numpy as np
@@ -25,10 +25,9 @@ from calibration.identification.samples import Samples
 from calibration.identification.solve import Solution
 from calibration.observations import Floats, Observations, Strings
 
-_MOST_PIECES = 200  # of the samples that lack inputs of effects at one joint; more make the fit slow
+_MOST_RUNS = 100  # of the samples that lack inputs of effects at one joint; more make the fit slow
 _LARGEST = 1.5  # prior sigmas; the usual effect, such as half the width of a play, is one
 _CHANCE = 2.0  # standard errors
-_PART = "part "  # in the name of an unknown of a part of a run
 
 
 def filled_in(observations: Observations, samples: Samples) -> Observations:
@@ -40,83 +39,105 @@ def filled_in(observations: Observations, samples: Samples) -> Observations:
         observations: n rows.
         samples: made from these rows.
     """
+    standstill = np.unique(samples.standstill, return_inverse=True)[1][samples.of_row]
     extra = {
-        name: values if name.endswith("_rate") else _filled_in(values, samples.of_row)
+        name: values if name.endswith("_rate") else _filled_in(values, standstill)
         for name, values in observations.extra.items()
     }
     return replace(observations, extra=extra)
 
 
-def _filled_in(values: Floats, of_row: Integers) -> Floats:
+def _filled_in(values: Floats, standstill: Integers) -> Floats:
     known = np.isfinite(values)
     if known.all() or not known.any():
         return values
-    number = np.bincount(of_row, known)
-    mean = np.bincount(of_row, np.where(known, values, 0.0)) / np.where(number > 0, number, np.nan)
-    return np.where(known, values, mean[of_row])
+    number = np.bincount(standstill, known)
+    mean = np.bincount(standstill, np.where(known, values, 0.0)) / np.where(number > 0, number, np.nan)
+    return np.where(known, values, mean[standstill])
+
+
+@dataclass(frozen=True)
+class Unknowns:
+    """Unknown displacements of the m samples that lack inputs of effects.
+
+    Attributes:
+        runs: coefficients that consecutive samples have in common, as a joint may not have moved meanwhile.
+        variance: (m, joints) variance of each sample's own part, as the joint may have moved, deg^2 or mm^2.
+        along_axes_mm2: (m,) the same of the prisms' positions, mm^2 per axis.
+    """
+
+    runs: EffectColumns
+    variance: Floats
+    along_axes_mm2: Floats
+
+    def is_like(self, other: Unknowns | None) -> bool:
+        """Return True if the same samples have unknowns, perhaps of a different size."""
+        if other is None:
+            return False
+        pairs = ((self.variance, other.variance), (self.along_axes_mm2, other.along_axes_mm2))
+        return self.runs.names == other.runs.names and all(np.array_equal(a > 0.0, b > 0.0) for a, b in pairs)
 
 
 def unknown_inputs(
     effects: Sequence[FittedEffect], context: EffectContext, samples: Samples, implausible: Collection[str] = ()
-) -> EffectColumns | None:
-    """Return unknown displacements of the samples that lack inputs of effects; None if there are no such samples.
+) -> Unknowns | None:
+    """Return the unknown displacements of samples that lack inputs of effects; None if there are no such samples.
 
-    Consecutive samples that lack them have one unknown in common, as the joint may not have moved meanwhile, and each
-    has one of its own, as it may have. Their prior variance is that of a prediction in such rows.
+    The variance of the part in common, and of each sample's own part, is that of a prediction in such rows.
 
     Args:
         effects: the effects.
         context: of the rows.
         samples: made from these rows.
-        implausible: names of unknowns to leave out.
+        implausible: names of runs to leave out.
     """
     applied = AppliedEffects(effects, context.chain)
     session = context.observations.session[np.unique(samples.of_row, return_index=True)[1]]
     by_joint = samples.average(applied.unknown_variance(context))
+    along_axes_mm2 = samples.average(applied.unknown_mm2(context))
+    if not (by_joint.any() or along_axes_mm2.any()):
+        return None
     parts = [
         _at_joint(name, number, by_joint[:, number], session) for name, number in context.chain.joint_index.items()
     ]
-    parts.append(_at_prisms(samples.average(applied.unknown_mm2(context)), session))
-    found = joined([part for part in parts if len(part)], len(samples))
-    found = _only(found, np.array([name not in implausible for name in found.names], dtype=bool))
-    return found if len(found) else None
+    runs = joined([part for part in (*parts, _at_prisms(along_axes_mm2, session)) if len(part)], len(samples))
+    kept = np.array([name not in implausible for name in runs.names], dtype=bool)
+    return Unknowns(_only(runs, kept), by_joint, along_axes_mm2)
 
 
-def implausible_unknowns(joint: JointFit, unknowns: EffectColumns) -> EffectColumns:
-    """Return the unknowns of whole runs that are larger than the effects can be, so there must be another cause.
+def implausible_runs(joint: JointFit, unknowns: Unknowns) -> EffectColumns:
+    """Return the unknowns of runs that are larger than the effects can be, so there must be another cause.
 
     Args:
         joint: a fit with these unknowns.
         unknowns: as in `with_unknowns`.
     """
     first = len(joint.context.chain)
-    own = slice(first, first + len(unknowns))
+    own = slice(first, first + len(unknowns.runs))
     value, error = np.abs(joint.fit.x[own]), np.sqrt(np.diag(joint.fit.covariance)[own])
-    beyond = value > _LARGEST * unknowns.prior_sigma + _CHANCE * error
-    beyond &= [_PART not in name for name in unknowns.names]  # a single sample that is off is an outlier
-    return _only(unknowns, beyond)
+    return _only(unknowns.runs, value > _LARGEST * unknowns.runs.prior_sigma + _CHANCE * error)
 
 
 def _at_joint(name: str, number: int, variance: Floats, session: Strings) -> EffectColumns:
     """Return the unknowns of one joint; `variance` (m,) is positive in the samples that have them."""
-    pieces = _pieces(variance > 0.0, session)
+    runs = _runs(variance > 0.0, session)
     return EffectColumns(
-        tuple(f"unknown@{name}:{piece}" for piece in pieces),
-        np.full(len(pieces), number),
-        _indicators(pieces, len(variance)),
-        np.array([math.sqrt(variance[own].mean()) for own in pieces.values()]),
+        tuple(f"unknown@{name}:{run[0]}-{run[-1]}" for run in runs),
+        np.full(len(runs), number),
+        _indicators(runs, len(variance)),
+        np.array([math.sqrt(variance[run].mean()) for run in runs]),
     )
 
 
 def _at_prisms(variance: Floats, session: Strings) -> EffectColumns:
     """Return the unknowns of the prisms' positions, along each axis; `variance` as for a joint."""
-    pieces = _pieces(variance > 0.0, session)
-    is_here = _indicators(pieces, len(variance))
+    runs = _runs(variance > 0.0, session)
+    is_here = _indicators(runs, len(variance))
     return EffectColumns(
-        tuple(f"unknown@prism:{axis} {piece}" for axis in "xyz" for piece in pieces),
-        np.full(3 * len(pieces), NO_JOINT),
-        np.zeros((len(variance), 3 * len(pieces))),
-        np.array([math.sqrt(variance[own].mean()) for _ in "xyz" for own in pieces.values()]),
+        tuple(f"unknown@prism:{axis}{run[0]}-{run[-1]}" for axis in "xyz" for run in runs),
+        np.full(3 * len(runs), NO_JOINT),
+        np.zeros((len(variance), 3 * len(runs))),
+        np.array([math.sqrt(variance[run].mean()) for _ in "xyz" for run in runs]),
         np.stack([np.kron(axis, is_here) for axis in np.eye(3)], axis=1),
     )
 
@@ -131,26 +152,20 @@ def _only(every: EffectColumns, kept: NDArray[np.bool_]) -> EffectColumns:
     )
 
 
-def _pieces(lacks: NDArray[np.bool_], session: Strings) -> dict[str, Integers]:
-    """Return runs of consecutive samples of a session that lack an input, and the parts of each run, by name."""
+def _runs(lacks: NDArray[np.bool_], session: Strings) -> list[Integers]:
+    """Return the longest runs of several consecutive samples of a session that lack an input, in their order."""
     found = np.flatnonzero(lacks)
-    if not len(found):
-        return {}
     starts = np.flatnonzero((np.diff(found) > 1) | (session[found[1:]] != session[found[:-1]])) + 1
-    length = math.ceil(len(found) / _MOST_PIECES)
-    pieces = {}
-    for run in np.split(found, starts):
-        pieces[f"{run[0]}-{run[-1]}"] = run
-        if len(run) > length:
-            pieces |= {f"{_PART}{own[0]}-{own[-1]}": own for own in np.split(run, range(length, len(run), length))}
-    return pieces
+    runs = [run for run in np.split(found, starts) if len(run) > 1]
+    longest = sorted(runs, key=len, reverse=True)[:_MOST_RUNS]
+    return sorted(longest, key=lambda run: int(run[0]))
 
 
-def _indicators(pieces: Mapping[str, Integers], samples: int) -> Floats:
-    """Return (m, k): 1 in the samples of each piece, else 0."""
-    out = np.zeros((samples, len(pieces)))
-    for number, own in enumerate(pieces.values()):
-        out[own, number] = 1.0
+def _indicators(runs: Sequence[Integers], samples: int) -> Floats:
+    """Return (m, k): 1 in the samples of each run, else 0."""
+    out = np.zeros((samples, len(runs)))
+    for number, run in enumerate(runs):
+        out[run, number] = 1.0
     return out
 
 
@@ -162,7 +177,7 @@ def with_warning(
     Args:
         found: the result.
         effects: effects whose inputs are lacking.
-        implausible: result of `implausible_unknowns`.
+        implausible: result of `implausible_runs`.
         samples: of the fit.
     """
     moved = implausible.column.any(axis=1)
@@ -176,7 +191,7 @@ def with_warning(
     return replace(found, warnings=(*found.warnings, told), structured=True)
 
 
-def with_unknowns(solution: Solution, unknowns: EffectColumns, prior: Prior) -> Solution:
+def with_unknowns(solution: Solution, unknowns: Unknowns, prior: Prior) -> Solution:
     """Refit a solution of the kinematics alone with unknown displacements of some samples.
 
     Args:
@@ -184,23 +199,31 @@ def with_unknowns(solution: Solution, unknowns: EffectColumns, prior: Prior) -> 
         unknowns: result of `unknown_inputs`.
         prior: prior of the solution.
     """
-    fit = refine(solution.chain, solution.samples, solution.fit.x, prior=prior, additions=unknowns)
-    return replace(solution, fit=fit, additions=unknowns)
+    samples = replace(
+        solution.samples,
+        station_covariance=solution.samples.station_covariance + unknowns.along_axes_mm2[:, None, None] * np.eye(3),
+        unknown_variance=unknowns.variance,
+    )
+    additions = unknowns.runs if len(unknowns.runs) else None
+    fit = refine(solution.chain, samples, solution.fit.x, prior=prior, additions=additions)
+    return replace(solution, samples=samples, fit=fit, additions=additions)
 
 
-def without_unknowns(found: Adopted, unknowns: EffectColumns) -> Adopted:
+def without_unknowns(found: Adopted, samples: Samples, unknowns: Unknowns) -> Adopted:
     """Return kinematics and effects without the unknowns of the training rows, which a model does not have.
 
     Args:
         found: kinematics and effects that were fitted with these unknowns.
+        samples: the samples without them.
         unknowns: as in `with_unknowns`.
     """
     first = len(found.solution.chain)
-    kept = np.delete(np.arange(len(found.solution.fit.x)), slice(first, first + len(unknowns)))
+    kept = np.delete(np.arange(len(found.solution.fit.x)), slice(first, first + len(unknowns.runs)))
     alone, fit = found.geometric, found.solution.fit
     together = replace(fit, x=fit.x[kept], covariance=fit.covariance[np.ix_(kept, kept)])
+    additions = found.solution.additions if found.effects else None
     return replace(
         found,
-        solution=replace(found.solution, fit=together, additions=found.solution.additions if found.effects else None),
+        solution=replace(found.solution, samples=samples, fit=together, additions=additions),
         geometric=replace(alone, x=alone.x[:first], covariance=alone.covariance[:first, :first]),
     )

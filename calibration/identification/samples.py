@@ -49,6 +49,8 @@ class Samples:
         reading_scatter: (joints,) variance of readings among repeats, deg^2 or mm^2; 0 if there are too few repeats.
         standstill: (m,) number of the standstill. Samples with the same number share those random errors of their
             readings that repeats do not show.
+        unknown_variance: (m, joints) variance of readings due to effects whose inputs are unknown, deg^2 or mm^2; None
+            for none.
     """
 
     data: ChainData
@@ -60,6 +62,7 @@ class Samples:
     fixes: Floats
     reading_scatter: Floats
     standstill: Integers
+    unknown_variance: Floats | None = None
 
     def __len__(self) -> int:
         return len(self.data)
@@ -76,6 +79,7 @@ class Samples:
             of_row=np.arange(len(data)),
             fixes=self.fixes[rows],
             standstill=np.arange(len(data)),
+            unknown_variance=None if self.unknown_variance is None else self.unknown_variance[rows],
         )
 
     def average(self, values: Floats) -> Floats:
@@ -90,7 +94,7 @@ class Samples:
     def own_variance(self, rig: Rig) -> Floats:
         """Return the (m, joints) variance of each sample's mean readings without the shared part, deg^2 or mm^2."""
         own: Floats = np.minimum(reading_variance(rig), self.reading_scatter) / self.fixes[:, None]
-        return own
+        return own if self.unknown_variance is None else own + self.unknown_variance
 
     def own_covariance(self, rig: Rig, joint_jacobian: Floats) -> Floats:
         """Return the (m, 3, 3) covariance without the part shared by a standstill, mm^2; arguments as `covariance`."""
@@ -108,8 +112,9 @@ class Samples:
         return shared + self.own_covariance(rig, joint_jacobian)
 
     def variance(self, rig: Rig, joint_jacobian: Floats) -> float:
-        """Return the mean variance of a coordinate, mm^2; arguments as `covariance`."""
-        return float(np.trace(self.covariance(rig, joint_jacobian), axis1=1, axis2=2).mean()) / 3.0
+        """Return the mean variance of a coordinate without unknown effects, mm^2; arguments as `covariance`."""
+        known = replace(self, unknown_variance=None).covariance(rig, joint_jacobian)
+        return float(np.trace(known, axis1=1, axis2=2).mean()) / 3.0
 
 
 def averaged(chain: Chain, observations: Observations) -> Samples:

@@ -131,7 +131,7 @@ def _requested(task: Task, solution: Solution) -> Adopted:
     if unknowns is None:
         return found
     given = with_unknowns(solution, unknowns, task.prior)
-    return without_unknowns(adopt(given, rows, task.effects, prior=task.prior), unknowns)
+    return without_unknowns(adopt(given, rows, task.effects, prior=task.prior), solution.samples, unknowns)
 
 
 def _pde_paper(task: Task) -> Adopted:

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from calibration.effects.columns import NO_JOINT, EffectColumns
+from calibration.effects.columns import NO_JOINT
 from calibration.effects.context import EffectContext
 from calibration.effects.fitted import Choice
 from calibration.effects.library import library
-from calibration.gap.unknown_inputs import filled_in, unknown_inputs
+from calibration.gap.unknown_inputs import Unknowns, filled_in, unknown_inputs
 from calibration.identification.samples import averaged
 from calibration.identification.solve import place
 from calibration.observations import Observations, parse_observations
@@ -52,8 +52,20 @@ def numbers() -> NDArray[np.intp]:
 @pytest.mark.long
 @pytest.mark.parametrize(
     "lacking",
-    [(numbers() >= 30) & (numbers() < 60), numbers() >= 100, np.random.default_rng(21).random(160) < 0.25],
-    ids=["fifteen poses", "the last thirty poses", "a quarter at random"],
+    [
+        (numbers() >= 30) & (numbers() < 60),
+        numbers() >= 100,
+        np.random.default_rng(21).random(160) < 0.25,
+        numbers() % 4 < 2,
+        numbers() % 2 == 0,
+    ],
+    ids=[
+        "fifteen poses",
+        "the last thirty poses",
+        "a quarter at random",
+        "every second pose",
+        "one prism of each pose",
+    ],
 )
 def test_play_is_named_alone_and_whole_where_its_direction_is_unknown_in_some_rows(lacking: NDArray[np.bool_]) -> None:
     found = named(without(session(), lacking))
@@ -98,7 +110,15 @@ def test_an_effect_that_is_asked_for_by_name_keeps_its_size_where_its_input_is_u
     assert "backlash@theta4 is left out in 60 of 160 rows: this data lacks the column theta4_dir" in model.warnings
 
 
-def unknowns(family: str, where: str, value: float, rows: Observations) -> EffectColumns | None:
+def test_the_size_is_right_where_hundreds_of_samples_in_a_row_lack_the_input() -> None:
+    data = session_csv(300, 3, hidden=f"backlash@theta4:width_rad={WIDTH_RAD}")
+    rows = parse_observations(data, SOURCE.rig, "session.csv")
+    model = identify(SOURCE.rig, SOURCE.text, without(rows, np.arange(600) >= 330), effects="backlash@theta4")
+    (effect,) = model.effects
+    assert effect.coefficients[0].value == pytest.approx(WIDTH_RAD, rel=0.02)
+
+
+def unknowns(family: str, where: str, value: float, rows: Observations) -> Unknowns | None:
     """Return the unknowns of rows of which each is a sample, for one effect of a given size."""
     chain, _, start = place(SOURCE.rig, rows)
     context = EffectContext(chain, start.x, rows)
@@ -107,43 +127,47 @@ def unknowns(family: str, where: str, value: float, rows: Observations) -> Effec
     return unknown_inputs([effect], context, averaged(chain, rows))
 
 
-def test_each_run_of_samples_has_an_unknown_of_the_play_s_size_in_common_and_one_of_its_own_for_each() -> None:
+def test_each_run_of_samples_has_an_unknown_of_the_play_s_size_in_common_and_each_sample_one_of_its_own() -> None:
     lacking = np.isin(numbers(), (30, 31, 32, 50))
     found = unknowns("backlash", "theta4", WIDTH_RAD, without(session(), lacking))
     assert found is not None
-    ran = [np.flatnonzero(own).tolist() for own in found.column.T]
-    assert ran == [[30, 31, 32], [30], [31], [32], [50]]
-    assert set(found.joint.tolist()) == {SOURCE.rig.joint_names.index("theta4")}
-    assert found.prior_sigma == pytest.approx(np.full(5, np.degrees(WIDTH_RAD / 2)))
+    assert [np.flatnonzero(own).tolist() for own in found.runs.column.T] == [[30, 31, 32]]
+    theta4 = SOURCE.rig.joint_names.index("theta4")
+    assert found.runs.joint.tolist() == [theta4]
+    size_deg = np.degrees(WIDTH_RAD / 2)
+    assert found.runs.prior_sigma == pytest.approx(size_deg)
+    assert found.variance[:, theta4] == pytest.approx(np.where(lacking, size_deg**2, 0.0))
+    assert not np.delete(found.variance, theta4, axis=1).any()
     assert unknowns("backlash", "theta4", WIDTH_RAD, session()) is None
 
 
 def test_a_run_ends_with_its_session() -> None:
-    rows = without(session(), np.isin(numbers(), (30, 31)))
-    found = unknowns("backlash", "theta4", WIDTH_RAD, replace(rows, session=np.where(numbers() < 31, "one", "two")))
+    rows = without(session(), np.isin(numbers(), (30, 31, 32, 33)))
+    found = unknowns("backlash", "theta4", WIDTH_RAD, replace(rows, session=np.where(numbers() < 32, "one", "two")))
     assert found is not None
-    assert [np.flatnonzero(own).tolist() for own in found.column.T] == [[30], [31]]
+    assert [np.flatnonzero(own).tolist() for own in found.runs.column.T] == [[30, 31], [32, 33]]
 
 
-def test_thousands_of_samples_without_an_input_have_no_more_than_a_few_hundred_unknowns() -> None:
+def test_of_many_runs_the_longest_have_an_unknown_in_common() -> None:
     rows = session().select(np.tile(numbers(), 5))
     moved = rows.position_mm + 1e-3 * np.repeat(np.arange(5), len(session()))[:, None]  # so that none is a copy
     many = replace(rows, position_mm=moved, pose=np.arange(len(rows)).astype(str))
-    found = unknowns("backlash", "theta4", WIDTH_RAD, without(many, np.arange(len(rows)) >= 300))
+    found = unknowns("backlash", "theta4", WIDTH_RAD, without(many, np.arange(len(rows)) % 4 < 2))
     assert found is not None
-    assert 150 < len(found) <= 201
-    assert (found.column.sum(axis=1) == np.where(np.arange(len(rows)) >= 300, 2.0, 0.0)).all()
+    assert len(found.runs) == 100
+    assert (found.variance.any(axis=1) == (np.arange(len(rows)) % 4 < 2)).all()
 
 
 def test_an_effect_on_the_prisms_has_unknowns_along_all_axes() -> None:
     warm = replace(session(), extra={**session().extra, "temperature_degC": 5.0 + numbers() / 10.0})
-    found = unknowns("thermal_expansion", "boom", 12e-6, without(warm, numbers() == 40, "temperature_degC"))
+    lacking = np.isin(numbers(), (40, 41))
+    found = unknowns("thermal_expansion", "boom", 12e-6, without(warm, lacking, "temperature_degC"))
     assert found is not None
-    assert found.shift_mm is not None
-    assert set(found.joint.tolist()) == {NO_JOINT}
-    assert found.shift_mm[40].tolist() == np.eye(3).tolist()
-    assert not np.delete(found.shift_mm, 40, axis=0).any()
-    assert (found.prior_sigma > 0.0).all()
+    assert found.runs.shift_mm is not None
+    assert set(found.runs.joint.tolist()) == {NO_JOINT}
+    assert found.runs.shift_mm[40].tolist() == found.runs.shift_mm[41].tolist() == np.eye(3).tolist()
+    assert not found.runs.shift_mm[~lacking].any()
+    assert ((found.along_axes_mm2 > 0.0) == lacking).all()
 
 
 def test_rows_of_a_standstill_share_its_inputs_but_not_its_rates() -> None:
