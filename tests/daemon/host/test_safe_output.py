@@ -17,7 +17,7 @@ def test_an_error_names_the_file_that_could_not_be_written(tmp_path: Path) -> No
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (4, hard))
     try:
-        with pytest.raises(OSError) as caught:  # noqa: PT011 - the file's name is what counts
+        with pytest.raises(OSError, match=r"rigcal\.toml") as caught:
             write_file(path, b"longer than that")
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))

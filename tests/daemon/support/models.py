@@ -169,10 +169,10 @@ def states(rig: ModelRig) -> dict[int, str]:
     return {model.id: model.state for model in rig.models.all()}
 
 
-def refusal(command: object, status: int, **arguments: object) -> str:
+def refusal(command: Callable[[dict[str, Any]], object], status: int, **arguments: object) -> str:
     """What a command says that refuses with an exit status."""
     with pytest.raises((CommandError, NotInStoreError)) as caught:
-        command(arguments)  # type: ignore[operator]  # any of the registry's commands
+        command(arguments)
     assert getattr(caught.value, "status", WRONG_USE) == status
     return str(caught.value)
 
