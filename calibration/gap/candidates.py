@@ -132,8 +132,22 @@ def _possible(
     return found, disabled
 
 
+def partly_lacking(context: EffectContext, families: Collection[str]) -> Iterator[tuple[str, str]]:
+    """Yield family and place of each effect that can be looked for, but whose inputs some rows lack.
+
+    Args:
+        context: context of the observations.
+        families: names of the families that may be named.
+    """
+    for name in sorted(families):
+        family = library()[name]
+        for where in family.places(context.rig):
+            if LEAST_KNOWN <= family.known(context, where).mean() < 1.0:
+                yield name, where
+
+
 def partly_known(context: EffectContext, families: Collection[str]) -> Iterator[str]:
-    """Yield a sentence for each input that some but fewer than half of the rows have.
+    """Yield a sentence for each input that fewer than half of the rows have, and also other rows or another place.
 
     Effects with such inputs are not candidates, and their errors may be attributed to other effects.
 
@@ -144,15 +158,17 @@ def partly_known(context: EffectContext, families: Collection[str]) -> Iterator[
     lacking: dict[tuple[str, int], list[str]] = {}
     for name in sorted(families):
         family = library()[name]
-        for where in family.places(context.rig):
-            known = family.known(context, where)
-            if 0.0 < known.mean() < LEAST_KNOWN:
-                need = family.needs(where), int(known.sum())
+        known = {where: family.known(context, where) for where in family.places(context.rig)}
+        is_elsewhere = "{where}" in family.column and any(rows.any() for rows in known.values())
+        for where, rows in known.items():
+            if 0.0 < rows.mean() < LEAST_KNOWN or (is_elsewhere and not rows.any()):
+                need = family.needs(where), int(rows.sum())
                 lacking.setdefault(need, []).append(f"{name}@{where}")
-    for (needs, rows), names in lacking.items():
+    for (needs, number), names in lacking.items():
+        have = f"{number} of {len(context)} rows have, fewer than half" if number else "no row has"
         yield (
-            f"not looked for: {', '.join(names)}; needs {needs}, which {rows} of {len(context)} rows have, fewer than "
-            "half: these effects may be reported under a different name"
+            f"not looked for: {', '.join(names)}; needs {needs}, which {have}: these effects may be reported under a "
+            "different name"
         )
 
 

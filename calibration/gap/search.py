@@ -23,6 +23,7 @@ from calibration.gap.background.outside import (
     residual_formula,
 )
 from calibration.gap.background.search import background_log_bayes_factor
+from calibration.gap.candidates import partly_lacking
 from calibration.gap.detection import detect
 from calibration.gap.formulas.grammar import Formula, Grammar
 from calibration.gap.joint_fit import OUTLIER, Problem, joint_fit
@@ -36,6 +37,7 @@ from calibration.gap.unknown_inputs import (
     filled_in,
     implausible_runs,
     unknown_inputs,
+    unknowns_of_any_size,
     with_unknowns,
     with_warning,
     without_unknowns,
@@ -47,7 +49,7 @@ from calibration.observations import Observations
 
 _REGIME = 15.0  # log Bayes factor required of an effect in a part of the data, as variable and border are selected
 _MOST_REPEATS = 5  # of the search, as effects that lack inputs in some rows may be found with unknowns for others
-_CONTRADICTION = 30.0  # nats that an unknown larger than its effect can be counts against it
+_CONTRADICTION = 30.0  # nats that an unknown larger than its effect counts against it
 _LEAST_SAMPLES = 60  # with fewer samples, the evidence of a background may come from a few fixes
 
 
@@ -88,44 +90,51 @@ def search(
 def _with_unknowns(problem: Problem, families: Collection[str]) -> tuple[SearchResult, Unknowns | None]:
     """Return the effects that the data require, and the unknowns of samples that lack inputs of these effects.
 
-    The search is repeated with these unknowns. An unknown that is larger than its effect can be has another cause: if
-    that gets a name without the unknown, it is left out.
+    The effects that lack inputs, and their sizes, are first found with unknowns of any size, so that only the samples
+    that have the inputs speak. An unknown that is larger than its effect can be has another cause: if that gets a name
+    without the unknown, it is left out.
     """
     solution, samples = problem.solution, problem.solution.samples
-    first = found = _search(problem, families)
-    effects, unknowns = _lack_inputs(found) or _may_lack_inputs(found), None
+    context = problem.kinematics_only().context
+    unknowns = unknowns_of_any_size(partly_lacking(context, families), context, samples)
+    if unknowns is None:
+        return _search(problem, families), None
+
+    def given(unknowns: Unknowns) -> SearchResult:
+        return _search(replace(problem, solution=with_unknowns(solution, unknowns, problem.prior)), families)
+
+    found = given(unknowns)
+    effects = _lack_inputs(found)
+    plain = None if effects else _search(problem, families)
+    if plain is not None:
+        effects = _lack_inputs(plain)
     for _ in range(_MOST_REPEATS):
         lacking = unknown_inputs(effects, found.joint.context, samples)
         if lacking is None or lacking.is_like(unknowns):
             break
-        unknowns = lacking
-        found = _search(replace(problem, solution=with_unknowns(solution, unknowns, problem.prior)), families)
+        unknowns, found = lacking, given(lacking)
         effects = _lack_inputs(found)
-    if unknowns is None or not effects:
-        return first, None
+    if not effects:
+        plain = plain or _search(problem, families)
+        # An effect that is seen only where rows that lack its inputs count as rows without it is none.
+        return (found, unknowns) if _lack_inputs(plain) else (plain, None)
     implausible = implausible_runs(found.joint, unknowns)
     if not len(implausible):
         return found, unknowns
     fewer = unknown_inputs(effects, found.joint.context, samples, implausible.names)
-    if fewer is not None:
-        tried = _search(replace(problem, solution=with_unknowns(solution, fewer, problem.prior)), families)
-        if _names_more(tried, found, len(implausible)):
-            return tried, fewer
+    if fewer is not None and _names_more(tried := given(fewer), found, len(implausible)):
+        return tried, fewer
     return replace(found, adopted=with_warning(found.adopted, effects, implausible, samples)), unknowns
 
 
 def _lack_inputs(found: SearchResult) -> list[FittedEffect]:
-    """Return the effects of a result that lack inputs in some rows."""
+    """Return the effects of a result that lack inputs in some rows, or else the most probable alternative that does."""
     context, samples = found.joint.context, found.problem.solution.samples
-    return [effect for effect in found.joint.effects if unknown_inputs([effect], context, samples) is not None]
-
-
-def _may_lack_inputs(found: SearchResult) -> list[FittedEffect]:
-    """Return the most probable effect not in a result that lacks inputs in some rows, as a list; empty for none."""
-    context, samples = found.joint.context, found.problem.solution.samples
-    scored = [*found.alternatives, *(one for one in found.steps[0].scored if one.log_bayes_factor > 0.0)]
-    effects = [one.fitted(context) for one in scored]
-    return [effect for effect in effects if unknown_inputs([effect], context, samples) is not None][:1]
+    effects = found.joint.effects, [one.fitted(context) for one in found.alternatives]
+    named, possible = (
+        [effect for effect in some if unknown_inputs([effect], context, samples) is not None] for some in effects
+    )
+    return named or possible[:1]
 
 
 def _names_more(tried: SearchResult, found: SearchResult, fewer: int) -> bool:

@@ -2,22 +2,25 @@
 
 The effect exists in these rows, too, but its size there is unknown. Taken as zero, it would remain in their errors and
 get another name: a pose whose direction is unknown looks like a zero that has moved for a time. Such rows therefore
-have unknown displacements of the effect's usual size in the fit.
+have unknown displacements in the fit: first of any size, so that only the other rows show which effects there are and
+how large they are, then of the size of these effects.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import compress
 
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.effects.base import JointFamily
 from calibration.effects.columns import NO_JOINT, EffectColumns, Integers, joined
 from calibration.effects.context import EffectContext
 from calibration.effects.fitted import AppliedEffects, FittedEffect
+from calibration.effects.library import library
 from calibration.gap.adoption import Adopted
 from calibration.gap.joint_fit import JointFit
 from calibration.identification.refinement import Prior, refine
@@ -25,9 +28,12 @@ from calibration.identification.samples import Samples
 from calibration.identification.solve import Solution
 from calibration.observations import Floats, Observations, Strings
 
-_MOST_RUNS = 100  # of the samples that lack inputs of effects at one joint; more make the fit slow
-_LARGEST = 1.5  # prior sigmas; the usual effect, such as half the width of a play, is one
-_CHANCE = 2.0  # standard errors
+_LEAST_STANDSTILLS = 3  # of a run
+_MOST_RUNS = 20  # of samples that lack inputs of effects at one joint; more make the fit slow
+_CHANCE = 3.0  # standard errors
+_SAME_SIZE = 1.2  # ratio
+_ANY_SIZE = {"revolute": 5.0, "prismatic": 200.0}  # deg, mm: larger than any effect
+_ANY_SIZE_MM = 500.0  # the same for an effect that moves prisms
 
 
 def filled_in(observations: Observations, samples: Samples) -> Observations:
@@ -62,20 +68,48 @@ class Unknowns:
 
     Attributes:
         runs: coefficients that consecutive samples have in common, as a joint may not have moved meanwhile.
-        variance: (m, joints) variance of each sample's own part, as the joint may have moved, deg^2 or mm^2.
+        variance: (m, joints) variance of each standstill's own part, as the joint may have moved, deg^2 or mm^2.
         along_axes_mm2: (m,) the same of the prisms' positions, mm^2 per axis.
+        largest: (k,) largest size of the effects in the rows that have their inputs, for each of the k runs.
     """
 
     runs: EffectColumns
     variance: Floats
     along_axes_mm2: Floats
+    largest: Floats
 
-    def is_like(self, other: Unknowns | None) -> bool:
-        """Return True if the same samples have unknowns, perhaps of a different size."""
-        if other is None:
-            return False
+    def is_like(self, other: Unknowns) -> bool:
+        """Return True if the same samples have unknowns, of about the same size."""
         pairs = ((self.variance, other.variance), (self.along_axes_mm2, other.along_axes_mm2))
-        return self.runs.names == other.runs.names and all(np.array_equal(a > 0.0, b > 0.0) for a, b in pairs)
+        return self.runs.names == other.runs.names and all(_are_like(*pair) for pair in pairs)
+
+
+def _are_like(one: Floats, other: Floats) -> bool:
+    return bool((one <= _SAME_SIZE**2 * other).all() and (other <= _SAME_SIZE**2 * one).all())
+
+
+def unknowns_of_any_size(
+    effects: Iterable[tuple[str, str]], context: EffectContext, samples: Samples
+) -> Unknowns | None:
+    """Return unknown displacements of any size of samples that lack inputs; None if there are no such samples.
+
+    Args:
+        effects: families and places of the effects whose inputs may be lacking.
+        context: of the rows.
+        samples: made from these rows.
+    """
+    by_joint, along_axes_mm2 = np.zeros((len(context), len(context.chain.joint_index))), np.zeros(len(context))
+    for name, where in effects:
+        family = library()[name]
+        lacks = ~family.known(context, where)
+        if isinstance(family, JointFamily):
+            by_joint[lacks, context.chain.joint_index[where]] = _ANY_SIZE[family.kind] ** 2
+        else:
+            along_axes_mm2[lacks] = _ANY_SIZE_MM**2
+    if not (by_joint.any() or along_axes_mm2.any()):
+        return None
+    runs = joined([], len(samples))
+    return Unknowns(runs, samples.average(by_joint), samples.average(along_axes_mm2), np.empty(0))
 
 
 def unknown_inputs(
@@ -83,7 +117,7 @@ def unknown_inputs(
 ) -> Unknowns | None:
     """Return the unknown displacements of samples that lack inputs of effects; None if there are no such samples.
 
-    The variance of the part in common, and of each sample's own part, is that of a prediction in such rows.
+    The variance of the part in common, and of each standstill's own part, is that of a prediction in such rows.
 
     Args:
         effects: the effects.
@@ -93,20 +127,25 @@ def unknown_inputs(
     """
     applied = AppliedEffects(effects, context.chain)
     session = context.observations.session[np.unique(samples.of_row, return_index=True)[1]]
+    of_sample = session, samples.standstill
     by_joint = samples.average(applied.unknown_variance(context))
     along_axes_mm2 = samples.average(applied.unknown_mm2(context))
     if not (by_joint.any() or along_axes_mm2.any()):
         return None
     parts = [
-        _at_joint(name, number, by_joint[:, number], session) for name, number in context.chain.joint_index.items()
+        _at_joint(name, number, by_joint[:, number], *of_sample) for name, number in context.chain.joint_index.items()
     ]
-    runs = joined([part for part in (*parts, _at_prisms(along_axes_mm2, session)) if len(part)], len(samples))
+    runs = joined([part for part in (*parts, _at_prisms(along_axes_mm2, *of_sample)) if len(part)], len(samples))
     kept = np.array([name not in implausible for name in runs.names], dtype=bool)
-    return Unknowns(_only(runs, kept), by_joint, along_axes_mm2)
+    columns = applied.columns(context)
+    at_joints = np.abs(columns.change(applied.values, len(parts))).max(axis=0)
+    at_prisms_mm = np.abs(columns.shifted_mm(applied.values)).max()
+    largest = np.where(runs.joint == NO_JOINT, at_prisms_mm, at_joints[runs.joint])
+    return Unknowns(_only(runs, kept), by_joint, along_axes_mm2, largest[kept])
 
 
 def implausible_runs(joint: JointFit, unknowns: Unknowns) -> EffectColumns:
-    """Return the unknowns of runs that are larger than the effects can be, so there must be another cause.
+    """Return the unknowns of runs that are larger than the effects, so there must be another cause.
 
     Args:
         joint: a fit with these unknowns.
@@ -115,12 +154,12 @@ def implausible_runs(joint: JointFit, unknowns: Unknowns) -> EffectColumns:
     first = len(joint.context.chain)
     own = slice(first, first + len(unknowns.runs))
     value, error = np.abs(joint.fit.x[own]), np.sqrt(np.diag(joint.fit.covariance)[own])
-    return _only(unknowns.runs, value > _LARGEST * unknowns.runs.prior_sigma + _CHANCE * error)
+    return _only(unknowns.runs, value > unknowns.largest + _CHANCE * error)
 
 
-def _at_joint(name: str, number: int, variance: Floats, session: Strings) -> EffectColumns:
+def _at_joint(name: str, number: int, variance: Floats, session: Strings, standstill: Integers) -> EffectColumns:
     """Return the unknowns of one joint; `variance` (m,) is positive in the samples that have them."""
-    runs = _runs(variance > 0.0, session)
+    runs = _runs(variance > 0.0, session, standstill)
     return EffectColumns(
         tuple(f"unknown@{name}:{run[0]}-{run[-1]}" for run in runs),
         np.full(len(runs), number),
@@ -129,9 +168,9 @@ def _at_joint(name: str, number: int, variance: Floats, session: Strings) -> Eff
     )
 
 
-def _at_prisms(variance: Floats, session: Strings) -> EffectColumns:
+def _at_prisms(variance: Floats, session: Strings, standstill: Integers) -> EffectColumns:
     """Return the unknowns of the prisms' positions, along each axis; `variance` as for a joint."""
-    runs = _runs(variance > 0.0, session)
+    runs = _runs(variance > 0.0, session, standstill)
     is_here = _indicators(runs, len(variance))
     return EffectColumns(
         tuple(f"unknown@prism:{axis}{run[0]}-{run[-1]}" for axis in "xyz" for run in runs),
@@ -152,11 +191,11 @@ def _only(every: EffectColumns, kept: NDArray[np.bool_]) -> EffectColumns:
     )
 
 
-def _runs(lacks: NDArray[np.bool_], session: Strings) -> list[Integers]:
-    """Return the longest runs of several consecutive samples of a session that lack an input, in their order."""
+def _runs(lacks: NDArray[np.bool_], session: Strings, standstill: Integers) -> list[Integers]:
+    """Return the longest runs of consecutive samples of a session that lack an input, in their order."""
     found = np.flatnonzero(lacks)
     starts = np.flatnonzero((np.diff(found) > 1) | (session[found[1:]] != session[found[:-1]])) + 1
-    runs = [run for run in np.split(found, starts) if len(run) > 1]
+    runs = [run for run in np.split(found, starts) if len(np.unique(standstill[run])) >= _LEAST_STANDSTILLS]
     longest = sorted(runs, key=len, reverse=True)[:_MOST_RUNS]
     return sorted(longest, key=lambda run: int(run[0]))
 

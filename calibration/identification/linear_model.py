@@ -85,7 +85,7 @@ class LinearModel:
         self._position_mm = samples.position_mm[self.order]
         self._station = samples.station_covariance[self.order]
         self._rates = samples.rates[self.order] * chain.rig.station.timing_sigma_s
-        self._shared = samples.shared_variance(chain.rig)
+        self._shared = samples.shared_variance(chain.rig)[self.order]
         self._variance = self._shared + samples.own_variance(chain.rig)[self.order]
         added = np.zeros(0) if additions is None else additions.prior_sigma
         self._added_precision = 1.0 / added**2

@@ -140,11 +140,11 @@ def _assemble(block: Floats, by_joint: Floats, sigma: Floats, root: Floats, shar
     """Write the lower triangle of A of one standstill to `out`; `shared` is scratch space with as many rows."""
     for r in range(len(out)):
         fix, c = r // 3, r % 3
-        for k in range(len(sigma)):
-            shared[r, k] = root[fix] * sigma[k] * by_joint[fix, c, k]
+        for k in range(sigma.shape[1]):
+            shared[r, k] = root[fix] * sigma[fix, k] * by_joint[fix, c, k]
         for q in range(3 * fix):
             total = 0.0
-            for k in range(len(sigma)):
+            for k in range(sigma.shape[1]):
                 total += shared[r, k] * shared[q, k]
             out[r, q] = total
         for q in range(3 * fix, r + 1):
@@ -195,17 +195,17 @@ def _factorise(
 ) -> None:
     """Factor A by Cholesky, standstill by standstill.
 
-    Row 3 i + c of `factor` (3 m, widest) is the factor's row of coordinate c of fix i. `sigma` (joints,) is the shared
-    standard deviation of the readings, `root` (m,) is sqrt(w). `sums` (3,) receives log det A and the traces of A^-1
-    and A^-2.
+    Row 3 i + c of `factor` (3 m, widest) is the factor's row of coordinate c of fix i. `sigma` (m, joints) is the
+    shared standard deviation of the readings, `root` (m,) is sqrt(w). `sums` (3,) receives log det A and the traces of
+    A^-1 and A^-2.
     """
     widest = factor.shape[1]
-    shared, inverse = np.empty((widest, len(sigma))), np.empty((widest, widest))
+    shared, inverse = np.empty((widest, sigma.shape[1])), np.empty((widest, widest))
     sums[0], sums[1], sums[2] = 0.0, 0.0, 0.0
     for g in range(len(start) - 1):
         i, j = start[g], start[g + 1]
         own = factor[3 * i : 3 * j, : 3 * (j - i)]
-        _assemble(block[i:j], by_joint[i:j], sigma, root[i:j], shared, own)
+        _assemble(block[i:j], by_joint[i:j], sigma[i:j], root[i:j], shared, own)
         sums[0] += _cholesky(own)
         once, twice = _traces(own, inverse)
         sums[1] += once
@@ -323,7 +323,7 @@ def factorise(start: Integers, of_rows: Marginals, by_joint: Floats, shared: Flo
         start: (groups + 1,) first row of each standstill, and m.
         of_rows: the rows' own covariances.
         by_joint: (m, 3, joints) derivatives by the readings.
-        shared: (joints,) variance of the readings that the fixes of a standstill have in common, deg^2 or mm^2.
+        shared: (m, joints) variance of the readings that the fixes of a standstill have in common, deg^2 or mm^2.
         weight: (m,) probability that a row is no outlier.
     """
     root = np.sqrt(weight)

@@ -304,7 +304,7 @@ def _fit(
             if (np.abs(at - computed_at) > _SAME_NOISE * at).any():
                 fitted_share, computed_at = view.fitted_share, at
             excess = view.excess(step, fitted_share)
-            known = float(np.trace(view.of_rows.block, axis1=1, axis2=2).mean()) / 3.0
+            known = float(np.median(np.trace(view.of_rows.block, axis1=1, axis2=2))) / 3.0
             change = max(change, abs(excess - noise.excess) / known)
         if prior == "as-built" and model.tolerated.any():
             scale = view.prior_scale(moved.x)

@@ -49,8 +49,8 @@ class Samples:
         reading_scatter: (joints,) variance of readings among repeats, deg^2 or mm^2; 0 if there are too few repeats.
         standstill: (m,) number of the standstill. Samples with the same number share those random errors of their
             readings that repeats do not show.
-        unknown_variance: (m, joints) variance of readings due to effects whose inputs are unknown, deg^2 or mm^2; None
-            for none.
+        unknown_variance: (m, joints) variance of readings due to effects whose inputs are unknown, deg^2 or mm^2, which
+            all samples of a standstill share; None for none.
     """
 
     data: ChainData
@@ -87,14 +87,14 @@ class Samples:
         return _averages(self.of_row, values)
 
     def shared_variance(self, rig: Rig) -> Floats:
-        """Return the (joints,) variance of readings that is common to all samples of a standstill, deg^2 or mm^2."""
+        """Return the (m, joints) variance of readings that is common to all samples of a standstill, deg^2 or mm^2."""
         shared: Floats = np.maximum(reading_variance(rig) - self.reading_scatter, 0.0)
-        return shared
+        return np.tile(shared, (len(self), 1)) if self.unknown_variance is None else shared + self.unknown_variance
 
     def own_variance(self, rig: Rig) -> Floats:
         """Return the (m, joints) variance of each sample's mean readings without the shared part, deg^2 or mm^2."""
         own: Floats = np.minimum(reading_variance(rig), self.reading_scatter) / self.fixes[:, None]
-        return own if self.unknown_variance is None else own + self.unknown_variance
+        return own
 
     def own_covariance(self, rig: Rig, joint_jacobian: Floats) -> Floats:
         """Return the (m, 3, 3) covariance without the part shared by a standstill, mm^2; arguments as `covariance`."""
@@ -299,7 +299,7 @@ def left_out_errors(
         (m, 3) errors, mm.
     """
     own = samples.own_covariance(rig, joint_jacobian) + excess_variance * np.eye(3)
-    by_reading = joint_jacobian * np.sqrt(samples.shared_variance(rig))
+    by_reading = joint_jacobian * np.sqrt(samples.shared_variance(rig))[:, None, :]
     out = np.empty_like(error_mm)
     block = samples.standstill if groups is None else groups
     order = np.argsort(block, kind="stable")

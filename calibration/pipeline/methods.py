@@ -13,7 +13,13 @@ from calibration.effects.library import library, parse_effects
 from calibration.gap.adoption import Adopted, adopt
 from calibration.gap.search import search
 from calibration.gap.search_result import Remaining, remaining
-from calibration.gap.unknown_inputs import filled_in, unknown_inputs, with_unknowns, without_unknowns
+from calibration.gap.unknown_inputs import (
+    filled_in,
+    unknown_inputs,
+    unknowns_of_any_size,
+    with_unknowns,
+    without_unknowns,
+)
 from calibration.identification.checks import refuse_much_discarded
 from calibration.identification.refinement import Prior
 from calibration.identification.solve import Solution, solve
@@ -123,13 +129,19 @@ def _default(task: Task) -> Adopted:
 
 
 def _requested(task: Task, solution: Solution) -> Adopted:
-    """Return the effects that a task names, with unknowns for samples that lack inputs of these effects."""
+    """Return the effects that a task names, with unknowns for samples that lack inputs of these effects.
+
+    Their sizes are first found with unknowns of any size.
+    """
     rows = filled_in(task.observations, solution.samples)
-    found = adopt(solution, rows, task.effects, prior=task.prior)
     context = EffectContext(solution.chain, solution.fit.x, rows)
-    unknowns = unknown_inputs(found.effects, context, solution.samples)
+    names = () if task.effects == "none" else parse_effects(task.effects, task.rig)
+    unknowns = unknowns_of_any_size(names, context, solution.samples)
+    if unknowns is not None:
+        first = adopt(with_unknowns(solution, unknowns, task.prior), rows, task.effects, prior=task.prior)
+        unknowns = unknown_inputs(first.effects, context, solution.samples)
     if unknowns is None:
-        return found
+        return adopt(solution, rows, task.effects, prior=task.prior)
     given = with_unknowns(solution, unknowns, task.prior)
     return without_unknowns(adopt(given, rows, task.effects, prior=task.prior), solution.samples, unknowns)
 

@@ -106,8 +106,7 @@ def time_blocks(
         average: as for `smooth_blocks`.
         fine: True for waves as short as the number of rows allows.
     """
-    time_s = context.extra("time_s")
-    at = time_s if np.isfinite(time_s).all() and np.ptp(time_s) > 0.0 else np.arange(float(len(context)))
+    at = times_or_order(context)
     if len(at) < 4 * _ROWS_PER_WAVE:
         return ()
     number = np.arange(1, (min(len(at) // _ROWS_PER_WAVE, _MOST_WAVES) if fine else _TIME_WAVES) + 1)
@@ -186,6 +185,12 @@ def elastic_blocks(context: EffectContext, average: Callable[[Floats], Floats]) 
         )
         found.append(Block(name, "elastic", where, "load", columns.over(average)))
     return tuple(found)
+
+
+def times_or_order(context: EffectContext) -> Floats:
+    """Return the times (n,) of the rows, or their numbers if some times are not known or all are the same."""
+    time_s = context.extra("time_s")
+    return time_s if np.isfinite(time_s).all() and np.ptp(time_s) > 0.0 else np.arange(float(len(context)))
 
 
 def _over(average: Callable[[Floats], Floats], block: Block) -> Block:

@@ -18,7 +18,7 @@ from calibration.effects.families.base_compliance import BaseCompliance
 from calibration.effects.fitted import Choice
 from calibration.effects.library import library
 from calibration.effects.timing import StepFamily
-from calibration.gap.background.blocks import Block, drift_block, elastic_blocks, event_blocks
+from calibration.gap.background.blocks import Block, drift_block, elastic_blocks, event_blocks, times_or_order
 from calibration.gap.background.naming import Names, names_given_background
 from calibration.gap.background.outside import grammar_of_residuals
 from calibration.gap.background.search import (
@@ -107,7 +107,7 @@ def _drift(
 ) -> tuple[Sequence[Block], Sequence[Choice]]:
     """Return the drift, if the data prefer it to steps, and the steps that it makes superfluous."""
     context = problem.kinematics_only().context
-    drift = drift_block(context, problem.solution.samples.average, context.extra("time_s"))
+    drift = drift_block(context, problem.solution.samples.average, times_or_order(context))
     evidence = _Evidence(problem, known, [drift])
     whole = evidence.of(known)
     imitating = [step for step in steps if whole - evidence.of([c for c in known if c is not step]) < ODDS_OF_TWO]
