@@ -116,7 +116,7 @@ def overload() -> str | None:
 def _processor() -> Finding:
     if busy := overload():
         remedy = "`top` shows the busy processes; a simulated rig needs less time with a lower --rate"
-        return Finding("processor", "warning", f"{busy}: working devices may appear silent", remedy)
+        return Finding("processor", "warning", f"{busy}: working devices may appear silent or to jump", remedy)
     return Finding("processor", "good", "is not overloaded")
 
 

@@ -153,7 +153,7 @@ class GuideManager:
         return self._state()
 
     def done_command(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
-        """Handle the operator's confirmation that the step is carried out."""
+        """Handle the operator's confirmation that the step is carried out; the result names the step (`confirmed`)."""
         with self._record.turn:
             job, step_id = self._record.needs_step(arguments)
             step, run = job.step, job.run
@@ -172,7 +172,7 @@ class GuideManager:
                     raise CommandError(f"this step ends automatically: {headline(job)}", REFUSED)
             if step.kind == "shoot_control_point":
                 self._worker.wanted = step_id  # the guide's thread measures it; the state shows the progress
-            return self._state()
+            return {"confirmed": headline(job), **self._state()}
 
     def skip_command(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
         """Skip the step, or all remaining poses of the prism; the reason is stored."""

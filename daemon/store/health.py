@@ -158,8 +158,8 @@ class StoreWatch:
         self._size_bytes = size_bytes
         if damage := self._findings or self._store.damage:
             return "damaged", (
-                f"{path}: the store is damaged ({damage}); acquisition continues, but jobs do not run, and stored data "
-                "cannot be trusted: stop rigcal, keep the file, and restore the store from a backup"
+                f"{path}: the store is damaged: stop rigcal, keep the file, and restore the store from a backup; "
+                f"acquisition continues, but jobs do not run, and stored data cannot be trusted ({damage})"
             )
         if self._check is not None and self._findings is None:
             return "checking", (

@@ -158,10 +158,9 @@ def zero_lost(evidence: Evidence) -> Iterator[Finding]:
     Aborted and rejected sessions do not count. The model then gives no tip, no job uses sessions from before the jump,
     and the open session takes no more fixes. Cleared 10 s after none of these conditions holds.
     """
-    model = () if evidence.model is None else evidence.model.jumped
+    unchecked = dict.fromkeys((*(() if evidence.model is None else evidence.model.jumped), *evidence.zeros_lost))
     session = () if evidence.session is None else evidence.session.jumped
-    for joint in dict.fromkeys((*model, *session, *evidence.zeros_lost)):
-        yield (
-            joint,
-            f"{joint} has jumped by more than it can move, or its encoder was exchanged; its zero is no longer valid",
-        )
+    for joint in dict.fromkeys((*unchecked, *session)):
+        is_confirmed = joint not in unchecked and evidence.model is not None
+        what = "the open session takes no more fixes" if is_confirmed else "its zero is no longer valid"
+        yield joint, f"{joint} has jumped by more than it can move, or its encoder was exchanged; {what}"

@@ -45,7 +45,11 @@ def store_hangs(evidence: Evidence) -> Iterator[Finding]:
         yield "store", "a write to the store does not end"
 
 
-@rule("critical", "Follow the alarm text before you stop rigcal: a deleted file is lost for good when rigcal stops.")
+@rule(
+    "critical",
+    "If the store is damaged, stop rigcal and restore a backup (`rigcal store restore`). If a file is gone or was "
+    "replaced, save it as the alarm text says before you stop rigcal: it is lost for good when rigcal stops.",
+)
 def store_unsound(evidence: Evidence) -> Iterator[Finding]:
     """The store is damaged, or one of its files was replaced or is missing."""
     if evidence.store is not None and evidence.store.is_unsound:

@@ -257,6 +257,8 @@ def session_guide(socket: Path | None, config: Path | None, as_json: bool, **giv
         if not as_json:
             return {"guide": lead(say)}
     if not as_json:
+        if given["done"]:
+            echo(f"confirmed: {state['confirmed']}")
         summary(state)
     return state
 

@@ -461,6 +461,12 @@ def test_a_full_disk_does_not_send_anyone_to_the_cables_of_devices_that_are_not_
     )
 
 
+def test_a_checked_zero_is_not_called_invalid_while_the_open_session_stands_still_since_the_jump() -> None:
+    stopped = known(model=LiveModelHealth(1), session=replace(SESSION, jumped=("theta3",)))
+    (found,) = raised("zero_lost", stopped)
+    assert found.text.endswith("the open session takes no more fixes")
+
+
 def test_a_silent_station_is_one_alarm_although_it_did_not_answer_a_command() -> None:
     unanswered = event(E.INSTRUMENT_ERROR, "station")
     silent = known(unanswered, stations=[station("silent", "unknown", good_age_s=30)])

@@ -171,7 +171,8 @@ def test_hands_of_a_simulated_rig_aim_and_go_where_the_guide_says(daemon: Daemon
     daemon.wait("theta1", lambda: abs(state(daemon)["joints"][0]["now"] - 10.0) < 0.5)
     daemon.say("guide.skip", reason="fog")
     assert hand("aim", "r") == "the station is aimed at r\n"
-    daemon.say("guide.done")
+    done = rigcal(daemon, "--done")
+    assert done.stdout.startswith("confirmed: Aim at prism r\n"), done
     daemon.wait("a pose", lambda: state(daemon)["step"]["kind"] == "go_to_pose")
     assert hand("move").startswith("the boom moves to theta1_deg")
     daemon.wait("the boom", lambda: all(joint["is_there"] for joint in state(daemon)["joints"]))
