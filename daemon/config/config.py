@@ -229,6 +229,6 @@ def _sentence(error: ErrorDetails) -> str:
     message = reason(error, Config)[: 4 * _QUOTED]
     if error["loc"][-1:] == ("webhook_url",):  # it may hold a secret
         return f"{key}: {message}"
-    if isinstance(error["input"], dict):  # a whole table: the message names what is wrong in it
+    if isinstance(error["input"], dict) or repr(error["input"]) in message:  # the message names what is wrong
         return f"{key}: {message}"
     return f"{key}: {message}, found {as_toml(error['input'])}"
