@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -38,6 +38,7 @@ from calibration.gap.unknown_inputs import (
     implausible_runs,
     unknown_inputs,
     unknowns_of_any_size,
+    with_doubt,
     with_unknowns,
     with_warning,
     without_unknowns,
@@ -116,8 +117,10 @@ def _with_unknowns(problem: Problem, families: Collection[str]) -> tuple[SearchR
         effects = _lack_inputs(found)
     if not effects:
         plain = plain or _search(problem, families)
-        # An effect that is seen only where rows that lack its inputs count as rows without it is none.
-        return (found, unknowns) if _lack_inputs(plain) else (plain, None)
+        doubted = _lacking(plain.joint.effects, plain)
+        if not doubted:
+            return plain, None
+        return replace(found, adopted=with_doubt(found.adopted, doubted)), unknowns
     implausible = implausible_runs(found.joint, unknowns)
     if not len(implausible):
         return found, unknowns
@@ -129,12 +132,14 @@ def _with_unknowns(problem: Problem, families: Collection[str]) -> tuple[SearchR
 
 def _lack_inputs(found: SearchResult) -> list[FittedEffect]:
     """Return the effects of a result that lack inputs in some rows, or else the most probable alternative that does."""
+    possible = (one.fitted(found.joint.context) for one in found.alternatives)
+    return _lacking(found.joint.effects, found) or _lacking(possible, found)[:1]
+
+
+def _lacking(effects: Iterable[FittedEffect], found: SearchResult) -> list[FittedEffect]:
+    """Return those of some effects that lack inputs in some rows of a result."""
     context, samples = found.joint.context, found.problem.solution.samples
-    effects = found.joint.effects, [one.fitted(context) for one in found.alternatives]
-    named, possible = (
-        [effect for effect in some if unknown_inputs([effect], context, samples) is not None] for some in effects
-    )
-    return named or possible[:1]
+    return [effect for effect in effects if unknown_inputs([effect], context, samples) is not None]
 
 
 def _names_more(tried: SearchResult, found: SearchResult, fewer: int) -> bool:

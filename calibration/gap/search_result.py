@@ -319,15 +319,15 @@ class Remaining:
         """True if there is structure without a name."""
         names = self.found.given_background
         is_smooth = names is not None and names.background_log_bayes_factor > STRUCTURE
-        has_break = self.found.machine_break is not None
+        has_cause = self.found.machine_break is not None or self.found.adopted.structured
         return bool(
-            self.detection.significant or self.found.alternatives or self.found.formulas or is_smooth or has_break
+            self.detection.significant or self.found.alternatives or self.found.formulas or is_smooth or has_cause
         )
 
     @property
     def adopted(self) -> Adopted:
-        """Kinematics and effects of the search; `structured` also if the remaining errors are significant."""
-        return replace(self.found.adopted, structured=self.significant or self.found.adopted.structured)
+        """Kinematics and effects of the search; `structured` if the remaining errors are significant."""
+        return replace(self.found.adopted, structured=self.significant)
 
     def warnings(self) -> Iterator[str]:
         """Yield sentences about existing effects that the model lacks, or may have at the wrong place."""

@@ -222,11 +222,23 @@ def with_warning(
     moved = implausible.column.any(axis=1)
     if implausible.shift_mm is not None:
         moved |= implausible.shift_mm.any(axis=(1, 2))
-    named = ", ".join(f"{effect.family}@{effect.where}" for effect in effects)
+    named = ", ".join(map(str, effects))
     told = (
         f"{samples.fixes[moved].sum():.0f} fixes that lack inputs of {named} have larger errors than that can cause: "
         "something else differs in just these fixes, such as the zero of a joint"
     )
+    return replace(found, warnings=(*found.warnings, told), structured=True)
+
+
+def with_doubt(found: Adopted, effects: Sequence[FittedEffect]) -> Adopted:
+    """Return a result with a warning of effects that are not named, and of the structure that they would explain.
+
+    Args:
+        found: the result with unknowns.
+        effects: effects that are found only if rows that lack their inputs count as rows without the effect.
+    """
+    named = ", ".join(map(str, effects))
+    told = f"not named: {named}; the rows that have all inputs do not show it, and the other rows have errors like it"
     return replace(found, warnings=(*found.warnings, told), structured=True)
 
 

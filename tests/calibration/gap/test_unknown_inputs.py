@@ -134,6 +134,18 @@ def test_a_step_is_named_alone_where_some_rows_have_no_time(hidden: str, lacking
     assert list(found) == [hidden.partition(":")[0]]
 
 
+@pytest.mark.long
+def test_an_effect_that_the_rows_with_its_input_do_not_show_is_not_named() -> None:
+    """All of these were approached from one side, so the play cannot show there; the others have a different zero."""
+    rows, late = with_hidden("", 70), numbers() >= FIRST_LACKING
+    theta4 = rows.joints["theta4"] + np.where(late, 0.5 * SLIPPED_DEG, 0.0)
+    approached = np.where(late, np.nan, 1.0)
+    moved = replace(rows, joints={**rows.joints, "theta4": theta4}, extra={**rows.extra, "theta4_dir": approached})
+    found = find_gap(SOURCE.rig, SOURCE.text, moved, families=("backlash",))
+    assert found.verdict == "unidentified"
+    assert any(warning.startswith("not named: backlash@theta4; the rows that have all") for warning in found.warnings)
+
+
 def test_a_place_whose_input_no_row_has_is_reported_as_not_looked_for() -> None:
     rows = without(session(), numbers() >= 0)
     found = find_gap(SOURCE.rig, SOURCE.text, rows, families=("backlash",))
