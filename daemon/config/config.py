@@ -229,6 +229,9 @@ def _sentence(error: ErrorDetails) -> str:
     message = reason(error, Config)[: 4 * _QUOTED]
     if error["loc"][-1:] == ("webhook_url",):  # it may hold a secret
         return f"{key}: {message}"
-    if isinstance(error["input"], dict) or repr(error["input"]) in message:  # the message names what is wrong
+    found = error["input"]
+    if isinstance(found, dict) or (
+        isinstance(found, str) and repr(found) in message
+    ):  # the message names what is wrong
         return f"{key}: {message}"
-    return f"{key}: {message}, found {as_toml(error['input'])}"
+    return f"{key}: {message}, found {as_toml(found)}"

@@ -45,12 +45,15 @@ def unsteady(observations: Observations, rig: Rig) -> Observations:
     return replace(twice, joints=joints)
 
 
-@pytest.fixture(scope="module", params=["readings that stand", "readings that scatter"])
+@pytest.fixture(scope="module", params=["readings that stand", "readings that scatter", "unknown joints"])
 def fitted(request: pytest.FixtureRequest, noisy_joints: Rig) -> tuple[Chain, Samples, Fit]:
     observations = standstills(RigTruth(noisy_joints, 21), 40, 21)
     if request.param == "readings that scatter":
         observations = unsteady(observations, noisy_joints)
     chain, samples, start = place(noisy_joints, observations)
+    if request.param == "unknown joints":
+        unknown = np.where(np.arange(len(samples))[:, None] % 3 == 0, samples.shared_variance(noisy_joints), 0.0)
+        samples = replace(samples, unknown_variance=unknown)
     return chain, samples, refine(chain, samples, start.x)
 
 
@@ -60,7 +63,8 @@ def dense(chain: Chain, samples: Samples, x: Floats, excess: float) -> tuple[Flo
     assert samples.standstill is not None
     together = np.kron(samples.standstill[:, None] == samples.standstill, np.ones((3, 3)))
     by_joint = lin.joint_jacobian.reshape(3 * len(samples), -1)
-    covariance = together * ((by_joint * samples.shared_variance(chain.rig)) @ by_joint.T)
+    shared = by_joint * np.sqrt(np.repeat(samples.shared_variance(chain.rig), 3, axis=0))
+    covariance = together * (shared @ shared.T)
     covariance += block_diag(*samples.station_covariance) + excess * np.eye(len(covariance))
     own = samples.own_variance(chain.rig)
     for row, (jacobian, rate) in enumerate(zip(lin.joint_jacobian, samples.rates, strict=True)):

@@ -125,6 +125,10 @@ def test_neither_is_true_a_number_nor_an_empty_text_a_directory(tmp_path: Path, 
     assert told in check(f'rig = "swdt82"\n{text}\n', tmp_path)
 
 
+def test_a_value_that_an_error_names_is_not_repeated(tmp_path: Path) -> None:
+    assert check(f'{GOOD}profile = "leica"\n', tmp_path).endswith("topcon_gts8")
+
+
 @pytest.mark.parametrize(
     ("text", "told"),
     [
