@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import replace
 
 import numpy as np
 
 from calibration.effects.fitted import FittedEffect
+from calibration.effects.library import library
 from calibration.gap.adoption import Adopted, adopted
 from calibration.gap.background.blocks import displacement_blocks, possible_blocks, smooth_blocks, time_blocks
 from calibration.gap.background.breaks import find_break
@@ -23,7 +24,7 @@ from calibration.gap.background.outside import (
     residual_formula,
 )
 from calibration.gap.background.search import background_log_bayes_factor
-from calibration.gap.candidates import partly_lacking
+from calibration.gap.candidates import LEAST_KNOWN, partly_lacking
 from calibration.gap.detection import detect
 from calibration.gap.formulas.grammar import Formula, Grammar
 from calibration.gap.joint_fit import OUTLIER, Problem, joint_fit
@@ -50,6 +51,7 @@ from calibration.observations import Observations
 
 _REGIME = 15.0  # log Bayes factor required of an effect in a part of the data, as variable and border are selected
 _MOST_REPEATS = 5  # of the search, as effects that lack inputs in some rows may be found with unknowns for others
+_MOST_INPUTS = 4  # that are lacking in different rows, for a search with unknowns of each alone
 _CONTRADICTION = 30.0  # nats that an unknown larger than its effect counts against it
 _LEAST_SAMPLES = 60  # with fewer samples, the evidence of a background may come from a few fixes
 
@@ -96,18 +98,20 @@ def _with_unknowns(problem: Problem, families: Collection[str]) -> tuple[SearchR
     without the unknown, it is left out.
     """
     solution, samples = problem.solution, problem.solution.samples
-    context = problem.kinematics_only().context
-    unknowns = unknowns_of_any_size(partly_lacking(context, families), context, samples)
-    if unknowns is None:
-        return _search(problem, families), None
 
     def given(unknowns: Unknowns) -> SearchResult:
         return _search(replace(problem, solution=with_unknowns(solution, unknowns, problem.prior)), families)
 
-    found = given(unknowns)
-    effects = _lack_inputs(found)
-    plain = None if effects else _search(problem, families)
-    if plain is not None:
+    effects: list[FittedEffect] = []
+    unknowns, found, plain = None, None, None
+    for unknowns in _of_any_size(problem, families):
+        found = given(unknowns)
+        if effects := _lack_inputs(found):
+            break
+    if unknowns is None or found is None:
+        return _search(problem, families), None
+    if not effects:
+        plain = _search(problem, families)
         effects = _lack_inputs(plain)
     for _ in range(_MOST_REPEATS):
         lacking = unknown_inputs(effects, found.joint.context, samples)
@@ -128,6 +132,26 @@ def _with_unknowns(problem: Problem, families: Collection[str]) -> tuple[SearchR
     if fewer is not None and _names_more(tried := given(fewer), found, len(implausible)):
         return tried, fewer
     return replace(found, adopted=with_warning(found.adopted, effects, implausible, samples)), unknowns
+
+
+def _of_any_size(problem: Problem, families: Collection[str]) -> Iterator[Unknowns]:
+    """Yield the unknowns of any size of all samples that lack inputs.
+
+    Then yield those of one input after the other, where so many inputs are lacking that few rows have all.
+    """
+    context, samples = problem.kinematics_only().context, problem.solution.samples
+    effects = list(partly_lacking(context, families))
+    known = np.array([library()[name].known(context, where) for name, where in effects])
+    inputs = np.unique(known, axis=0, return_inverse=True)[1].reshape(-1) if effects else np.empty(0)
+    together = [effects]
+    if effects and known.all(axis=0).mean() < LEAST_KNOWN and inputs.max() < _MOST_INPUTS:
+        together += [
+            [effect for effect, own in zip(effects, inputs, strict=True) if own == number]
+            for number in range(inputs.max() + 1)
+        ]
+    for some in together:
+        if (unknowns := unknowns_of_any_size(some, context, samples)) is not None:
+            yield unknowns
 
 
 def _lack_inputs(found: SearchResult) -> list[FittedEffect]:

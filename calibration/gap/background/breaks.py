@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from calibration.gap.background.blocks import drift_block, event_block, time_blocks
+from calibration.gap.background.blocks import drift_block, event_block, time_blocks, times_or_order
 from calibration.gap.background.search import ODDS, background_log_bayes_factor
 from calibration.gap.joint_fit import JointFit, Problem
 from calibration.gap.projected.projection import Projection, from_products, rows_of
@@ -37,10 +37,8 @@ def find_break(problem: Problem, joint: JointFit) -> Break | None:
     samples, columns = problem.solution.samples, joint.context.observations.extra
     if len(samples) < _LEAST_SAMPLES:
         return None
-    variable = ROW if ROW in columns else "time_s"
-    of_row = joint.context.extra(variable)
-    if not np.isfinite(of_row).all():
-        return None
+    of_row = columns[ROW] if ROW in columns else times_or_order(joint.context)
+    variable = "time_s" if of_row is columns.get("time_s") else ROW
     size = np.linalg.norm(joint.error_mm(problem.solution), axis=1)
     weight = np.minimum(1.0, (_GROSS * np.median(size) / np.maximum(size, 1e-9)) ** 2)
     counted = replace(joint, fit=replace(joint.fit, weight=weight))

@@ -82,14 +82,14 @@ def test_a_machine_that_is_another_from_an_instant_on_is_found_and_told() -> Non
     assert gap.as_dict()["break"] == gap.machine_break.as_dict()
 
 
-def test_a_base_that_moved_far_in_rows_without_times_is_a_break_at_its_row() -> None:
+@pytest.mark.parametrize("has_times", [False, True], ids=["no row has a time", "one row has none"])
+def test_a_base_that_moved_far_in_rows_without_times_is_a_break_at_its_row(*, has_times: bool) -> None:
     rows = drawn("null", 0.0, 1945)
     moved_mm = np.where(np.arange(len(rows)) < len(rows) // 2, 0.0, 300.0)
-    rows = replace(
-        rows,
-        position_mm=rows.position_mm + moved_mm[:, None] * [1.0, 0.0, 0.0],
-        extra={name: column for name, column in rows.extra.items() if name != "time_s"},
-    )
+    extra = {name: column for name, column in rows.extra.items() if name != "time_s"}
+    if has_times:
+        extra["time_s"] = np.where(np.arange(len(rows)) == 8, np.nan, rows.extra["time_s"])
+    rows = replace(rows, position_mm=rows.position_mm + moved_mm[:, None] * [1.0, 0.0, 0.0], extra=extra)
     gap = find_gap(SOURCE.rig, SOURCE.text, rows)
     assert gap.machine_break is not None
     assert (gap.machine_break.variable, gap.machine_break.border) == ("row", len(rows) // 2 - 0.5)

@@ -120,6 +120,14 @@ def test_the_rows_that_have_the_input_decide_on_the_name(seed: int, width_rad: f
 
 
 @pytest.mark.long
+@pytest.mark.parametrize("seed", [41, 42])
+def test_an_effect_is_named_where_no_row_has_all_inputs(seed: int) -> None:
+    rows = with_hidden("backlash@theta4:width_rad=3e-3", seed)
+    found = named(without(without(rows, numbers() < 80), numbers() >= 80, "time_s"))
+    assert found == {"backlash@theta4": pytest.approx(3e-3, rel=0.05)}
+
+
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("hidden", "lacking"),
     [
