@@ -88,6 +88,7 @@ class Family(ABC):
         load_kind: the load on which the effect depends: `torque` of its own joint, measured or computed; `weights`,
             which are always computed; or empty.
         column: the optional column that the effect needs, with `{where}` for its place; empty for none.
+        least_known: smallest share of training rows in which the inputs must be known.
         limit_sigma: relative uncertainty of the hard limits, where they are derived from a load.
         shape_sigma: share of the change by which a real machine may deviate from the equation. It limits how much
             evidence for the effect is trusted in the presence of unexplained structure.
@@ -107,6 +108,7 @@ class Family(ABC):
     fixed: ClassVar[tuple[Coefficient, ...]] = ()
     load_kind: ClassVar[Literal["", "torque", "weights"]] = ""
     column: ClassVar[str] = ""
+    least_known: ClassVar[float] = 0.5
     limit_sigma: ClassVar[float] = 0.0
     shape_sigma: ClassVar[float] = 0.14
     depends_on_readings_only: ClassVar[bool] = False

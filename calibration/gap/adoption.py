@@ -12,7 +12,7 @@ from calibration.effects.context import EffectContext
 from calibration.effects.fitted import Choice, FittedEffect
 from calibration.effects.library import library, parse_effects
 from calibration.errors import DataError
-from calibration.gap.candidates import LEAST_KNOWN, candidate_at, variants_at
+from calibration.gap.candidates import candidate_at, variants_at
 from calibration.gap.joint_fit import JointFit, joint_fit, projected
 from calibration.gap.projected.projection import Projection
 from calibration.gap.screening import LOG_SCALE_ODDS, SCALES, Screen
@@ -63,8 +63,9 @@ def adopt(solution: Solution, observations: Observations, effects: str, *, prior
     names = parse_effects(effects, solution.chain.rig)
     for name, where in names:
         family = library()[name]
-        if family.known(context, where).mean() < LEAST_KNOWN:
-            raise DataError("observations", f"{name}@{where} needs {family.needs(where)}, in at least half of the rows")
+        if family.known(context, where).mean() < family.least_known:
+            share = "" if family.least_known == 1.0 else ", in at least half of the rows"
+            raise DataError("observations", f"{name}@{where} needs {family.needs(where)}{share}")
         if not family.variants(context, where):
             raise DataError("observations", f"{name}@{where} has no effect in any pose; leave it out")
     joint = _in_finest_forms(solution, _best_variants(solution, context, names, prior), prior)

@@ -21,8 +21,6 @@ from calibration.gap.projected.projection import Projection
 from calibration.gap.projected.rare_columns import without_zeros
 from calibration.observations import Floats
 
-LEAST_KNOWN = 0.5  # smallest share of rows in which the inputs of an effect must be known
-
 
 @dataclass(frozen=True)
 class CandidateEffect:
@@ -120,7 +118,7 @@ def _possible(
     for name in sorted(families):
         family = library()[name]
         places = family.places(context.rig)
-        known = [where for where in places if family.known(context, where).mean() >= LEAST_KNOWN]
+        known = [where for where in places if family.known(context, where).mean() >= family.least_known]
         here = [(name, where, variants_at(context, name, where)) for where in known if f"{name}@{where}" not in without]
         if not places:
             disabled[name] = f"rig {context.rig.name!r} has no place for it"
@@ -142,12 +140,12 @@ def partly_lacking(context: EffectContext, families: Collection[str]) -> Iterato
     for name in sorted(families):
         family = library()[name]
         for where in family.places(context.rig):
-            if LEAST_KNOWN <= family.known(context, where).mean() < 1.0:
+            if family.least_known <= family.known(context, where).mean() < 1.0:
                 yield name, where
 
 
 def partly_known(context: EffectContext, families: Collection[str]) -> Iterator[str]:
-    """Yield a sentence for each input that fewer than half of the rows have, and also other rows or another place.
+    """Yield a sentence for each input that too few rows have, and also other rows or another place.
 
     Effects with such inputs are not candidates, and their errors may be attributed to other effects.
 
@@ -161,11 +159,11 @@ def partly_known(context: EffectContext, families: Collection[str]) -> Iterator[
         known = {where: family.known(context, where) for where in family.places(context.rig)}
         is_elsewhere = "{where}" in family.column and any(rows.any() for rows in known.values())
         for where, rows in known.items():
-            if 0.0 < rows.mean() < LEAST_KNOWN or (is_elsewhere and not rows.any()):
+            if 0.0 < rows.mean() < family.least_known or (is_elsewhere and not rows.any()):
                 need = family.needs(where), int(rows.sum())
                 lacking.setdefault(need, []).append(f"{name}@{where}")
     for (needs, number), names in lacking.items():
-        have = f"{number} of {len(context)} rows have, fewer than half" if number else "no row has"
+        have = f"{number} of {len(context)} rows have, too few" if number else "no row has"
         yield (
             f"not looked for: {', '.join(names)}; needs {needs}, which {have}: these effects may be reported under a "
             "different name"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -24,7 +24,7 @@ from calibration.gap.background.outside import (
     residual_formula,
 )
 from calibration.gap.background.search import background_log_bayes_factor
-from calibration.gap.candidates import LEAST_KNOWN, partly_lacking
+from calibration.gap.candidates import partly_lacking
 from calibration.gap.detection import detect
 from calibration.gap.formulas.grammar import Formula, Grammar
 from calibration.gap.joint_fit import OUTLIER, Problem, joint_fit
@@ -37,6 +37,7 @@ from calibration.gap.unknown_inputs import (
     Unknowns,
     filled_in,
     implausible_runs,
+    of_any_size,
     unknown_inputs,
     unknowns_of_any_size,
     with_doubt,
@@ -51,9 +52,12 @@ from calibration.observations import Observations
 
 _REGIME = 15.0  # log Bayes factor required of an effect in a part of the data, as variable and border are selected
 _MOST_REPEATS = 5  # of the search, as effects that lack inputs in some rows may be found with unknowns for others
+_LEAST_COMPLETE = 0.5  # share of rows that have all inputs
 _MOST_INPUTS = 4  # that are lacking in different rows, for a search with unknowns of each alone
 _CONTRADICTION = 30.0  # nats that an unknown larger than its effect counts against it
 _LEAST_SAMPLES = 60  # with fewer samples, the evidence of a background may come from a few fixes
+
+_Given = tuple[SearchResult, Unknowns | None]
 
 
 def search(
@@ -76,13 +80,14 @@ def search(
     observations = filled_in(observations, solution.samples)
     seen = in_true_steps(solution, observations, prior)
     found, unknowns = _with_unknowns(Problem(seen, observations, prior, seed), families)
-    if seen is not solution:
+    if seen is not solution or unknowns is not None:
         # The model uses the reading noise of its rig file, and counts additional noise as scatter.
         given = solution if unknowns is None else with_unknowns(solution, unknowns, prior)
-        before = found.adopted
+        before, start = found.adopted, found.joint.fit.x
         outcome = Adopted(given, given.fit, reason=before.reason)
         if found.joint.choices:
-            joint = joint_fit(given, observations, found.joint.choices, prior, found.joint.fit.x)
+            start = start if unknowns is None else start[: len(solution.chain)]
+            joint = joint_fit(given, observations, found.joint.choices, prior, start)
             outcome = adopted(given, joint, before.reason)
         found = replace(found, adopted=replace(outcome, warnings=before.warnings, structured=before.structured))
     if unknowns is None:
@@ -90,48 +95,88 @@ def search(
     return replace(found, adopted=without_unknowns(found.adopted, solution.samples, unknowns))
 
 
-def _with_unknowns(problem: Problem, families: Collection[str]) -> tuple[SearchResult, Unknowns | None]:
-    """Return the effects that the data require, and the unknowns of samples that lack inputs of these effects.
+def _with_unknowns(problem: Problem, families: Collection[str]) -> _Given:
+    """Return the effects that the data require, and the unknowns of samples that lack their inputs, for the final fit.
 
     The effects that lack inputs, and their sizes, are first found with unknowns of any size, so that only the samples
-    that have the inputs speak. An unknown that is larger than its effect can be has another cause: if that gets a name
-    without the unknown, it is left out.
+    that have the inputs speak. Then all samples are fitted with unknowns of the size found. If no name is certain then,
+    as other causes would explain the samples that lack the input as well, the names of the first search stand. In the
+    final fit, unknowns have any size again, as those of an effect of one sign are no noise about zero.
     """
-    solution, samples = problem.solution, problem.solution.samples
-
-    def given(unknowns: Unknowns) -> SearchResult:
-        return _search(replace(problem, solution=with_unknowns(solution, unknowns, problem.prior)), families)
-
-    effects: list[FittedEffect] = []
-    unknowns, found, plain = None, None, None
-    for unknowns in _of_any_size(problem, families):
-        found = given(unknowns)
-        if effects := _lack_inputs(found):
-            break
-    if unknowns is None or found is None:
+    wide = _with_any_size(problem, families)
+    if wide is None:
         return _search(problem, families), None
-    if not effects:
-        plain = _search(problem, families)
-        effects = _lack_inputs(plain)
+    plain = None if _lack_inputs(wide[0]) else _search(problem, families)
+    sized = _with_sizes(problem, families, wide, _lack_inputs(plain or wide[0]))
+    if _lack_inputs(sized[0]):
+        return _without_implausible(problem, families, *sized)
+    if _lacking(wide[0].joint.effects, wide[0]):
+        return wide
+    plain = plain or _search(problem, families)
+    doubted = _lacking(plain.joint.effects, plain)
+    if not doubted:
+        return plain, None
+    return replace(sized[0], adopted=with_doubt(sized[0].adopted, doubted)), of_any_size(sized[1], problem.solution)
+
+
+def _given(problem: Problem, families: Collection[str], unknowns: Unknowns) -> tuple[SearchResult, Unknowns]:
+    return _search(
+        replace(problem, solution=with_unknowns(problem.solution, unknowns, problem.prior)), families
+    ), unknowns
+
+
+def _with_any_size(problem: Problem, families: Collection[str]) -> tuple[SearchResult, Unknowns] | None:
+    """Return the effects that samples with all inputs show, or else with one input; None if no inputs are lacking."""
+    found = None
+    for unknowns in _of_any_size(problem, families):
+        found = _given(problem, families, unknowns)
+        if _lack_inputs(found[0]):
+            break
+    return found
+
+
+def _with_sizes(
+    problem: Problem,
+    families: Collection[str],
+    wide: tuple[SearchResult, Unknowns],
+    effects: Sequence[FittedEffect],
+) -> tuple[SearchResult, Unknowns]:
+    """Return the effects that all samples require, with unknowns of the size of effects that lack inputs.
+
+    Args:
+        problem: the data.
+        families: families of effects that may be named.
+        wide: result with unknowns of any size.
+        effects: effects that lack inputs.
+    """
+    found, unknowns = wide
     for _ in range(_MOST_REPEATS):
-        lacking = unknown_inputs(effects, found.joint.context, samples)
+        lacking = unknown_inputs(effects, found.joint.context, problem.solution.samples)
         if lacking is None or lacking.is_like(unknowns):
             break
-        unknowns, found = lacking, given(lacking)
+        found, unknowns = _given(problem, families, lacking)
         effects = _lack_inputs(found)
-    if not effects:
-        plain = plain or _search(problem, families)
-        doubted = _lacking(plain.joint.effects, plain)
-        if not doubted:
-            return plain, None
-        return replace(found, adopted=with_doubt(found.adopted, doubted)), unknowns
+    return found, unknowns
+
+
+def _without_implausible(
+    problem: Problem, families: Collection[str], found: SearchResult, unknowns: Unknowns
+) -> _Given:
+    """Return a result without the unknowns that are larger than its effects, if their cause gets a name then.
+
+    Otherwise return it with a warning of them.
+    """
+    effects, samples = _lack_inputs(found), problem.solution.samples
     implausible = implausible_runs(found.joint, unknowns)
     if not len(implausible):
-        return found, unknowns
+        return found, of_any_size(unknowns, problem.solution)
     fewer = unknown_inputs(effects, found.joint.context, samples, implausible.names)
-    if fewer is not None and _names_more(tried := given(fewer), found, len(implausible)):
-        return tried, fewer
-    return replace(found, adopted=with_warning(found.adopted, effects, implausible, samples)), unknowns
+    if fewer is not None:
+        tried, _ = _given(problem, families, fewer)
+        if _names_more(tried, found, len(implausible)):
+            return tried, fewer
+    told = with_warning(found.adopted, effects, implausible, samples)
+    return replace(found, adopted=told), of_any_size(unknowns, problem.solution)
 
 
 def _of_any_size(problem: Problem, families: Collection[str]) -> Iterator[Unknowns]:
@@ -144,7 +189,7 @@ def _of_any_size(problem: Problem, families: Collection[str]) -> Iterator[Unknow
     known = np.array([library()[name].known(context, where) for name, where in effects])
     inputs = np.unique(known, axis=0, return_inverse=True)[1].reshape(-1) if effects else np.empty(0)
     together = [effects]
-    if effects and known.all(axis=0).mean() < LEAST_KNOWN and inputs.max() < _MOST_INPUTS:
+    if effects and known.all(axis=0).mean() < _LEAST_COMPLETE and inputs.max() < _MOST_INPUTS:
         together += [
             [effect for effect, own in zip(effects, inputs, strict=True) if own == number]
             for number in range(inputs.max() + 1)

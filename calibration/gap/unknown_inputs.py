@@ -112,6 +112,22 @@ def unknowns_of_any_size(
     return Unknowns(runs, samples.average(by_joint), samples.average(along_axes_mm2), np.empty(0))
 
 
+def of_any_size(unknowns: Unknowns, solution: Solution) -> Unknowns:
+    """Return unknown displacements of any size of the same samples.
+
+    Args:
+        unknowns: as returned by `unknown_inputs`.
+        solution: the solution whose samples have them.
+    """
+    sizes = np.array([_ANY_SIZE[joint.kind] for joint in solution.chain.rig.joints])
+    return Unknowns(
+        joined([], len(solution.samples)),
+        np.where(unknowns.variance > 0.0, sizes**2, 0.0),
+        np.where(unknowns.along_axes_mm2 > 0.0, _ANY_SIZE_MM**2, 0.0),
+        np.empty(0),
+    )
+
+
 def unknown_inputs(
     effects: Sequence[FittedEffect], context: EffectContext, samples: Samples, implausible: Collection[str] = ()
 ) -> Unknowns | None:

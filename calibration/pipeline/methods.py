@@ -15,7 +15,6 @@ from calibration.gap.search import search
 from calibration.gap.search_result import Remaining, remaining
 from calibration.gap.unknown_inputs import (
     filled_in,
-    unknown_inputs,
     unknowns_of_any_size,
     with_unknowns,
     without_unknowns,
@@ -129,17 +128,11 @@ def _default(task: Task) -> Adopted:
 
 
 def _requested(task: Task, solution: Solution) -> Adopted:
-    """Return the effects that a task names, with unknowns for samples that lack inputs of these effects.
-
-    Their sizes are first found with unknowns of any size.
-    """
+    """Return the effects that a task names, with unknowns of any size for samples that lack inputs of these effects."""
     rows = filled_in(task.observations, solution.samples)
     context = EffectContext(solution.chain, solution.fit.x, rows)
     names = () if task.effects == "none" else parse_effects(task.effects, task.rig)
     unknowns = unknowns_of_any_size(names, context, solution.samples)
-    if unknowns is not None:
-        first = adopt(with_unknowns(solution, unknowns, task.prior), rows, task.effects, prior=task.prior)
-        unknowns = unknown_inputs(first.effects, context, solution.samples)
     if unknowns is None:
         return adopt(solution, rows, task.effects, prior=task.prior)
     given = with_unknowns(solution, unknowns, task.prior)

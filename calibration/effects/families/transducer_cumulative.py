@@ -29,6 +29,7 @@ class TransducerCumulative(JointFamily):
     revealed_by = "returning to a pose measured before, after moving the joint back and forth many times"
     fixed = (Coefficient("mm_per_m", "mm/m", 0.03, -0.3, 0.3),)
     kind = "prismatic"
+    least_known = 1.0  # as the way that was travelled in other rows would be missing
     depends_on_travel = True
 
     def needs(self, where: str) -> str:

@@ -13,6 +13,7 @@ from calibration.effects.columns import NO_JOINT
 from calibration.effects.context import EffectContext
 from calibration.effects.fitted import Choice
 from calibration.effects.library import library
+from calibration.errors import DataError
 from calibration.gap.result import GapResult
 from calibration.gap.unknown_inputs import Unknowns, filled_in, unknown_inputs
 from calibration.identification.samples import averaged
@@ -117,6 +118,47 @@ def test_the_rows_that_have_the_input_decide_on_the_name(seed: int, width_rad: f
     rows = with_hidden(f"backlash@theta4:width_rad={width_rad}", seed)
     found = named(without(rows, numbers() >= first))
     assert found == {"backlash@theta4": pytest.approx(width_rad, rel=0.1)}
+
+
+def some_poses(share: float, seed: int) -> NDArray[np.bool_]:
+    """Return a mask of the rows of a random share of the poses."""
+    return np.repeat(np.random.default_rng(seed).random(len(numbers()) // 2) < share, 2)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("hidden", "seed", "column"),
+    [
+        ("base_settlement@base:tilt_x_rad_per_h=0.001:tilt_y_rad_per_h=0.0005:z_mm_per_h=3", 51, "time_s"),
+        ("leak_down@theta4:rad_per_s=2e-5", 302, "dwell_s"),
+    ],
+)
+def test_an_effect_of_one_sign_is_named_where_a_third_of_the_poses_lacks_its_input(
+    hidden: str, seed: int, column: str
+) -> None:
+    rows = without(with_hidden(hidden, seed), some_poses(0.35, seed), column)
+    assert list(named(rows)) == [hidden.partition(":")[0]]
+
+
+@pytest.mark.long
+def test_the_size_of_an_effect_of_one_sign_is_that_of_the_rows_that_have_its_input() -> None:
+    true, hidden = 1e-3, "base_settlement@base:tilt_x_rad_per_h=0.001:tilt_y_rad_per_h=0.0005:z_mm_per_h=3"
+    off = []
+    for seed in range(300, 310):
+        rows = without(with_hidden(hidden, seed), some_poses(0.3, seed), "time_s")
+        (effect,) = identify(SOURCE.rig, SOURCE.text, rows, effects="base_settlement@base").effects
+        off.append((effect.coefficients[0].value - true) / effect.coefficients[0].standard_error)
+    assert np.sqrt(np.mean(np.square(off))) < 1.5  # 1.0 where nothing is lacking
+
+
+def test_no_slip_with_travel_is_looked_for_where_the_order_of_some_rows_is_unknown() -> None:
+    rows = without(session(), numbers() < 2, "time_s")
+    told = "needs the column time_s in all rows or in none"
+    with pytest.raises(DataError, match=told):
+        identify(SOURCE.rig, SOURCE.text, rows, effects="transducer_cumulative@L2")
+    found = find_gap(SOURCE.rig, SOURCE.text, rows, families=("backlash", "transducer_cumulative"))
+    assert found.warnings[-1].startswith("not looked for: transducer_cumulative@L2")
+    assert told in found.warnings[-1]
 
 
 @pytest.mark.long
