@@ -50,6 +50,7 @@ from daemon.store.queries.sessions import SessionTable
 from daemon.store.queries.setups import SetupTable
 from daemon.store.store import Store
 from daemon.store.upkeep.housekeeping import Housekeeping, Keeping
+from daemon.store.upkeep.model_places import follow_moved_models
 from drivers.clock import NS_PER_S, TimeBudget
 from drivers.readings import Record
 
@@ -89,6 +90,7 @@ class Daemon:
         self._ended_threads = EndedThreads()
         declare_channels(store, parts.rig)
         store.try_events(parts.clock.now(), parts.rig.joint_names)
+        store.unless_damaged(partial(follow_moved_models, store, config.models_directory), None)
         self._watch = StoreWatch(store, parts.clock)
         self._housekeeping = Housekeeping(store, parts.clock, keeping_of(config))
         # Simulated and replayed rigs have their own clocks.

@@ -28,7 +28,7 @@ class SessionAdvice:
     def at_start(self, session: OpenSession) -> list[str]:
         """Return advice for a session that has just started."""
         points, missing = self._points(session, "start")
-        advice = []
+        advice = [f"from now on, fixes count as prism {session.prism}: aim the station at it, or at a control point"]
         if missing or not points:
             which = f"the control points {', '.join(missing)}" if missing else "a control point"
             advice.append(
@@ -78,8 +78,12 @@ class SessionAdvice:
             for joint in self._rig.joint_names
             if joint in session.jumped
         ]
+        before = (
+            "fixes before that stay in use; if the station was on another prism then as well, reject the session with "
+            f"`rigcal session reject {session.id}`"
+        )
         return jumps + [
-            f"{suspicion.reason}; fixes since then are not used{f': {suspicion.remedy}' if is_open else ''}"
+            f"{suspicion.reason}; fixes since then are not used{f': {suspicion.remedy}' if is_open else f', {before}'}"
             for suspicion in self._prisms.suspicions(session)
         ]
 

@@ -15,6 +15,7 @@ from daemon.store.captures import require_sound
 from daemon.store.errors import StoreError, storage_errors
 from daemon.store.migrations import unknown_migrations
 from daemon.store.reader import Reader
+from daemon.store.upkeep.model_places import place_of_model
 
 MOST_FINDINGS = 20
 MANIFEST = "manifest.json"
@@ -72,7 +73,8 @@ def check_store(path: Path, models: Path | None, go_on: Callable[[], None] = lam
             if models is not None:
                 for row in reader.rows(_MODELS):
                     looked_at += 1
-                    findings += _model_findings(row["id"], models / Path(row["path"]).name, row["manifest_sha256"])
+                    place = place_of_model(row["path"]) or Path(row["path"]).name
+                    findings += _model_findings(row["id"], models / place, row["manifest_sha256"])
         except sqlite3.DatabaseError as error:
             if error.sqlite_errorname == "SQLITE_INTERRUPT":
                 go_on()

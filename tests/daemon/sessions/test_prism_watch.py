@@ -79,6 +79,7 @@ def test_another_prism_s_fixes_never_become_observations_however_long_it_is_foll
     assert [s.station for s in rig.keeper.prism_suspicions()] == ["station"]
     (told,) = [sentence for sentence in rig.say("stop")["advice"] if "perhaps another prism" in sentence]
     assert "confirm-prism" not in told, "a closed session takes no confirmation"
+    assert "fixes before that stay in use; if the station was on another prism then as well, reject" in told
     assert rig.keeper.prism_suspicions() == []
 
 

@@ -218,10 +218,9 @@ def test_an_open_session_ends_where_its_station_is_not_configured_any_more(rig: 
 
 def test_the_operator_is_told_what_is_still_to_be_done(rig: Rig) -> None:
     rig.say("setup_new", id="S1")
-    assert (
-        "shoot a control point before the first pose (`rigcal session shoot NAME`)"
-        in rig.say("start", prism="r", kind="check")["advice"][0]
-    )
+    aim, shoot, *_ = rig.say("start", prism="r", kind="check")["advice"]
+    assert "from now on, fixes count as prism r: aim the station at it" in aim
+    assert "shoot a control point before the first pose (`rigcal session shoot NAME`)" in shoot
     rig.live(2)
     advice = rig.say("stop")["advice"]
     assert "control points not shot at the session's end" in advice[0]

@@ -29,6 +29,8 @@ from tests.daemon.support.acquisition import wait_until
 from tests.daemon.support.damage import small_disk
 from tests.daemon.support.store import BOOT, UTC_0, at, frame, table
 
+MODEL = Path("00001-gap", "model")  # where a gap job writes its model, beside its report
+
 
 def nothing() -> None:
     pass
@@ -44,7 +46,7 @@ class Site:
         self.store = Store(self.path)
         for n in range(20):
             self.store.mark_decoded(self.store.append_captures([frame(n)]))
-        model = self.models / "00001-gap"
+        model = self.models / MODEL
         model.mkdir(parents=True)
         (model / MANIFEST).write_text('{"a": 1}')
         (model / "model.json").write_text("{}")
@@ -97,7 +99,7 @@ def test_a_backup_of_a_store_that_is_written_to_is_restored_with_its_live_model(
     assert aside is not None
     assert (aside / "rigcal.sqlite").read_bytes() == b"rust"
     assert check_store(site.path, site.models).findings == ()
-    assert (site.models / "00001-gap" / "model.json").read_text() == "{}"
+    assert (site.models / MODEL / "model.json").read_text() == "{}"
     with contextlib.closing(Store(site.path)) as again:
         assert again.number("SELECT sum(captures) FROM raw_chunks", []) == held
 
@@ -240,7 +242,7 @@ def test_a_damaged_backup_takes_no_good_stores_place(site: Site, damage: str) ->
         with contextlib.closing(sqlite3.connect(backup / "rigcal.sqlite")) as db, db:
             db.execute("UPDATE raw_chunks SET chunk = zeroblob(200) WHERE id = 7")
     elif damage == "model":
-        (backup / "models" / "00001-gap" / MANIFEST).write_text('{"a": 2}')
+        (backup / "models" / MODEL / MANIFEST).write_text('{"a": 2}')
     elif damage == "models":
         site.store.update("models", {"id": 1}, {"state": "retired"})
         shutil.rmtree(backup)
@@ -329,7 +331,7 @@ def test_the_daemon_makes_one_a_day_and_tells_when_it_cannot(site: Site, monkeyp
         daily.step()
     assert len(backups(site.backups)) == 1
     clock.advance(90_000.0)
-    (site.models / "00001-gap" / MANIFEST).unlink()
+    (site.models / MODEL / MANIFEST).unlink()
     daily.step()
     assert "manifest.json cannot be read" in daily.error()
     assert len(backups(site.backups)) == 1
