@@ -31,7 +31,8 @@ CLEARED_SHOWN = 200
 STOP_S = 5.0
 UNWRITTEN_MAX = 1000  # cleared alarms kept in memory while the store cannot be written
 
-_FIRST = ("not_storing", "store_hangs")  # while they stand, the evidence for other alarms is old
+# Causes, the most general first: while they stand, the evidence for other alarms is old.
+_FIRST = ("not_storing", "store_hangs", "simulated_rig_ended", "link_down")
 _LEVELS: Mapping[Severity, int] = {"warning": logging.WARNING, "critical": logging.ERROR}
 
 
@@ -56,6 +57,10 @@ class _Active:
     row: int | None = None
     written: Alarm | None = None
     cleared: Stamp | None = None
+
+
+def _rank(kind: str) -> int:
+    return _FIRST.index(kind) if kind in _FIRST else len(_FIRST)
 
 
 def _nobody(notice: Notice) -> None:
@@ -115,7 +120,8 @@ class AlarmBoard(WokenThread):
     def status(self) -> dict[str, Any]:
         """Return the active alarms and the age of the last evaluation.
 
-        Critical alarms come first, those of a store that cannot be written before others, then the oldest first.
+        Critical alarms come first, among them a store that cannot be written and links that are closed, which may cause
+        others, then the oldest.
 
         Returns:
             `active`: kind, subject, severity, text, remedy, since_utc_ns and age_s of each alarm; `looked_age_s`: real
@@ -124,9 +130,7 @@ class AlarmBoard(WokenThread):
         now = self._clock.now()
         with self._turn:
             active, looked = list(self._active.values()), self._looked
-        active.sort(
-            key=lambda one: (one.alarm.severity != "critical", one.alarm.kind not in _FIRST, -now.since(one.raised))
-        )
+        active.sort(key=lambda one: (one.alarm.severity != "critical", _rank(one.alarm.kind), -now.since(one.raised)))
         shown = [
             {
                 **asdict(one.alarm),
@@ -198,7 +202,9 @@ class AlarmBoard(WokenThread):
                 active.cleared = now
                 self._unwritten.append(active)
                 self._tell(_notice("cleared", active, now))
-                lasted = duration(max(now.since(active.raised) / NS_PER_S, 0.0))
+                is_same_boot = now.boot_id == active.raised.boot_id
+                lasted_s = max(now.since(active.raised) / NS_PER_S, 0.0)
+                lasted = duration(lasted_s) if is_same_boot else "a restart of the computer"
                 log.info("alarm %s, %s is over after %s", active.alarm.kind, active.alarm.subject, lasted)
 
     def _work(self) -> None:

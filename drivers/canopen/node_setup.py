@@ -105,7 +105,7 @@ class SetupRunner:
 
     The caller feeds the nodes' answers and the time, and sends the frames returned by `take_frames`. The events
     returned by `take_events`, which is called once these frames are sent, are CONFIGURED, or ALARM for a node that does
-    not match or does not answer, and WARNING for values that could not be verified.
+    not match or does not answer, and WARNING for all values that could not be verified.
     """
 
     def __init__(self) -> None:
@@ -239,8 +239,10 @@ class SetupRunner:
 
     def _end(self, setup: NodeSetup, kind: EventKind, text: str, now: Stamp) -> None:
         """Report the end of a node's set-up, and start the next node."""
-        for warning in self._found.warnings:
-            self._events.append(DeviceEvent(setup.name, now, EventKind.WARNING, f"{setup.where}: {warning}"))
+        if warnings := self._found.warnings:  # in one event, as `status` shows the last one of a device
+            self._events.append(
+                DeviceEvent(setup.name, now, EventKind.WARNING, f"{setup.where}: {'; '.join(warnings)}")
+            )
         self._events.append(DeviceEvent(setup.name, now, kind, text))
         self._setup = None
         self.advance(now)

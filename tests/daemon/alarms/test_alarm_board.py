@@ -165,7 +165,10 @@ def test_an_alarm_shows_although_the_store_cannot_be_written_and_is_written_late
     assert [subject for subject, is_active in stored if is_active] == ["boom"]
 
 
-def test_an_alarm_of_an_earlier_run_goes_on_with_its_old_time_or_ends_after_a_grace(tmp_path: Path) -> None:
+def test_an_alarm_of_an_earlier_run_goes_on_with_its_old_time_or_ends_after_a_grace(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO)
     path = tmp_path / "rigcal.sqlite"
     before = Rig(path)
     before.pass_s(5, boom="gone", station="gone")
@@ -179,6 +182,7 @@ def test_an_alarm_of_an_earlier_run_goes_on_with_its_old_time_or_ends_after_a_gr
     (left,) = again.board.status()["active"]
     assert (left["subject"], left["since_utc_ns"]) == ("boom", since["boom"])
     assert again.stored() == [("boom", True), ("station", False)]
+    assert "station is over after a restart of the computer" in caplog.text, "whose clock may have been wrong"
     again.store.close()
 
 
@@ -316,8 +320,9 @@ def test_no_alarm_of_silence_is_raised_or_ends_by_time_in_which_nothing_is_decod
         assert looked(3, is_decoded=True) == []
 
 
-def test_a_store_that_cannot_be_written_is_told_before_older_critical_alarms(tmp_path: Path) -> None:
-    rig = Rig(tmp_path / "rigcal.sqlite", [unplugged, replace(unplugged, kind="not_storing")])
+def test_a_store_that_cannot_be_written_and_closed_links_are_told_before_older_critical_alarms(tmp_path: Path) -> None:
+    causes = [replace(unplugged, kind=kind) for kind in ("link_down", "not_storing")]
+    rig = Rig(tmp_path / "rigcal.sqlite", [unplugged, *causes])
     with contextlib.closing(rig.store):
         rig.pass_s(3, boom="gone")
-        assert [alarm["kind"] for alarm in rig.board.status()["active"]] == ["not_storing", "unplugged"]
+        assert [alarm["kind"] for alarm in rig.board.status()["active"]] == ["not_storing", "link_down", "unplugged"]
