@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
+from calibration.rig.words import counted
 from daemon.cli.client import utc, who
 from daemon.cli.lines.clock import session_clock_lines
 from daemon.cli.terminal import echo
@@ -102,7 +103,7 @@ def show_session(session: Mapping[str, Any]) -> None:
     """Print a session: counts, exclusions, control points, and why calibration does not use it."""
     echo(
         f"session {session['id']} ({session['kind']}, prism {session['prism']}, set-up {session['setup']}) is "
-        f"{session['state']}: {session['poses']} poses, {session['observations']} observations"
+        f"{session['state']}: {counted(session['poses'], 'pose')}, {counted(session['observations'], 'observation')}"
     )
     for reason, n in session["excluded"].items():
         echo(f"  {n} excluded: {reason}")

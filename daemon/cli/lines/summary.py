@@ -10,6 +10,7 @@ import textwrap
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
+from calibration.rig.words import counted
 from daemon.cli.lines.jobs import job_lines
 from daemon.cli.lines.state import (
     alarm_line,
@@ -49,8 +50,8 @@ def state_sentence(status: Mapping[str, Any]) -> str:
     if status["alarms"]["looked_age_s"] > _HELD_UP_S:
         return f"blocked: the daemon last evaluated its alarms {duration(status['alarms']['looked_age_s'])} ago"
     if session is not None:
-        counted = f"{session['poses']} poses, {session['observations']} observations"
-        return f"recording session {session['id']} ({session['kind']}, prism {session['prism']}): {counted}"
+        holds = f"{counted(session['poses'], 'pose')}, {counted(session['observations'], 'observation')}"
+        return f"recording session {session['id']} ({session['kind']}, prism {session['prism']}): {holds}"
     if (guide := status.get("guide")) is not None:
         return f"guide {guide['id']} is open, no session is open"
     if any(job["state"] == "running" for job in jobs):
