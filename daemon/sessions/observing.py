@@ -15,7 +15,7 @@ from functools import partial
 from calibration.rig.description import Rig
 from daemon.acquisition.joiner import JoinedFix, joint_inputs
 from daemon.commands import CHECK
-from daemon.sessions.open_session import CONSTANT_TOLERANCE_MM, OpenSession
+from daemon.sessions.open_session import CONSTANT_TOLERANCE_MM, OTHER_CONSTANT, OpenSession
 from daemon.sessions.prism_watch import PrismWatch
 from daemon.sessions.prisms.standstill_places import (
     ELSEWHERE,
@@ -271,4 +271,4 @@ def _why_another_constant(constants_mm: Mapping[str, float], fix: Fix) -> str | 
     first_mm = constants_mm.get(fix.station, fix.prism_constant_mm)
     if abs(fix.prism_constant_mm - first_mm) <= CONSTANT_TOLERANCE_MM:
         return None
-    return f"the station applies a prism constant of {fix.prism_constant_mm:g} mm, but applied {first_mm:g} mm at first"
+    return f"{OTHER_CONSTANT} {fix.prism_constant_mm:g} mm, but applied {first_mm:g} mm at first"

@@ -11,6 +11,7 @@ from daemon.sessions.prisms.guard import OperatorConfirmation, PrismGuard
 from daemon.sessions.station_setups import CONTROL_POINT_RADIUS_MM, Place
 from drivers.clock import Order, Stamp, lies_within
 
+OTHER_CONSTANT = "the station applies a prism constant of"  # the reasons for these exclusions begin with it
 CONSTANT_TOLERANCE_MM = 0.05  # tolerance of a prism constant, which stations hold in steps of 0.1 mm
 
 

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from daemon.acquisition.status.present import is_present
 from daemon.alarms.alarm import Finding, rule
 from daemon.alarms.evidence import Evidence
+from daemon.sessions.open_session import OTHER_CONSTANT
 from daemon.sessions.prisms.standstill_places import ELSEWHERE
 from drivers.readings import EventKind, LockState
 
@@ -107,6 +108,21 @@ def fixes_elsewhere(evidence: Evidence) -> Iterator[Finding]:
     """
     why = evidence.newest_excluded
     if evidence.session is not None and not evidence.suspicions and why is not None and why.startswith(ELSEWHERE):
+        yield evidence.session.id, f"fixes are not used: {why}"
+
+
+@rule(
+    "critical",
+    "Set the station's prism constant back. If the new one is right, stop the session and start another one.",
+    hold_s=10.0,
+)
+def other_prism_constant(evidence: Evidence) -> Iterator[Finding]:
+    """The station's prism constant was changed during the session, so its distances do not fit the earlier ones.
+
+    Fixes with the new constant are not used. Cleared 10 s after the newest fix is used again, or when the session ends.
+    """
+    why = evidence.newest_excluded
+    if evidence.session is not None and why is not None and why.startswith(OTHER_CONSTANT):
         yield evidence.session.id, f"fixes are not used: {why}"
 
 

@@ -323,6 +323,15 @@ CASES: dict[str, list[tuple[Evidence, list[str], Evidence]]] = {
             known(event(E.PRISM_JUMP, "station"), session=SESSION),
         )
     ],
+    "other_prism_constant": [
+        (
+            known(
+                session=SESSION, newest_excluded="the station applies a prism constant of 30 mm, but applied 0 mm at"
+            ),
+            ["s001-r"],
+            known(session=SESSION, newest_excluded="moving"),
+        ),
+    ],
     "fixes_elsewhere": [
         (
             known(session=SESSION, newest_excluded="another prism or a reflection: more fixes lie 0.20 m away"),
