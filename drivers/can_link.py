@@ -10,7 +10,8 @@ from dataclasses import dataclass
 
 from drivers.can.bus_options import slcan_port
 from drivers.can.frame import Frame
-from drivers.can.ports import OVERFLOW, Batch, CanLinkConfig, CanPort, open_port
+from drivers.can.port import OVERFLOW, Batch, CanPort
+from drivers.can.ports import CanLinkConfig, open_port
 from drivers.can.stamps import ReceiveStamps
 from drivers.canopen.node_setup import NodeSetup, SetupRunner
 from drivers.canopen.sync import SyncProducer
@@ -26,8 +27,8 @@ from drivers.stall_detector import CLOCK_WAS_SET, NOT_READ_IN_TIME, LateReport, 
 POLL_S = 0.05  # longest delay until a stop or a set-up request is noticed
 LOSS_CHECK_NS = NS_PER_S
 QUEUE_FULL = (
-    "the transmit queue is full, so frames are not sent: check that other nodes are powered and use the same bit rate, "
-    "and that the bus is not overloaded"
+    "the transmit queue is full or the adapter refuses frames, so they are not sent: check that other nodes are "
+    "powered and use the same bit rate, and that the bus is not overloaded"
 )
 
 Emit = Callable[[Capture | DeviceEvent | Gap], None]
@@ -383,7 +384,7 @@ class _Session:
     def _end_unsent(self) -> None:
         """Withdraw the warning that the transmit queue is full."""
         if self._unsent:
-            text = f"{self._name}: {self._unsent} frames were not sent while the transmit queue was full"
+            text = f"{self._name}: {self._unsent} frames were not sent as the queue was full or the adapter refused"
             self._emit(DeviceEvent(self._name, self._clock.now(), EventKind.WARNING, text, 0))
         self._unsent = 0
 

@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
 
 from drivers.can import frame as drivers_frame
-from drivers.can.ports import CanLinkConfig, CanPort, Interface, open_port
+from drivers.can.port import CanPort
+from drivers.can.ports import CanLinkConfig, Interface, open_port
 from drivers.errors import LinkError
 from drivers.stations.serial_port import SerialConfig, SerialPort
 from simulators.devices.can.bus import Frame

@@ -106,6 +106,7 @@ class SlcanLines:
 
     Attributes:
         malformed: number of lines that were neither a frame nor an answer to a command.
+        refused: number of commands that the adapter has refused since the last one that it has carried out.
     """
 
     # Upper case marks extended frames (T, R), lower case standard ones. Hexadecimal digits may be in either case.
@@ -119,17 +120,22 @@ class SlcanLines:
 
     def __init__(self) -> None:
         self._rest = b""
-        self.malformed = 0
+        self.malformed = self.refused = 0
 
     def feed(self, data: bytes) -> list[Frame]:
         """Return the frames that these bytes complete."""
-        # BEL is the adapter's error reply; like CR, it ends a line
-        *lines, self._rest = (self._rest + data).replace(b"\a", b"\r").split(b"\r")
+        # BEL refuses a command; like CR, it ends a line
+        *lines, self._rest = (self._rest + data).replace(b"\a", b"\a\r").split(b"\r")
         if len(self._rest) > self._LINE_MAX:
             self._rest = b""
             self.malformed += 1
         frames = []
-        for line in (line.strip(b"\n") for line in lines):  # some adapters end a line with CR and LF
+        for answer in (line.strip(b"\n") for line in lines):  # some adapters end a line with CR and LF
+            line = answer.removesuffix(b"\a")
+            if line != answer:
+                self.refused += 1
+            elif line in (b"", b"z", b"Z"):
+                self.refused = 0
             frame = self._frame(line)
             if frame is not None:
                 frames.append(frame)

@@ -13,36 +13,42 @@ from __future__ import annotations
 import abc
 import contextlib
 import errno
-import fcntl
 import itertools
 import os
 import queue
 import select
 import socket
 import struct
-import termios
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import can
 from can.interfaces.slcan import slcanBus
 from can.interfaces.virtual import VirtualBus
 
-from drivers.can.frame import DATA_MAX, Frame, SlcanLines, parse_can_frame, parse_multicast, slcan_line
+from drivers.can.frame import DATA_MAX, Frame, parse_can_frame, parse_multicast
+from drivers.can.port import (
+    BATCH_MAX,
+    INTERFACE_DROPS,
+    NOT_A_FRAME,
+    OVERFLOW,
+    Batch,
+    CanPort,
+    Received,
+    frame_of,
+    message_of,
+)
+from drivers.can.slcan_port import SlcanPort
 from drivers.clock import NS_PER_S
 from drivers.errors import LinkError
-from drivers.last_reads import more_may_wait
 
 Interface = Literal["socketcan", "virtual", "udp_multicast", "slcan"]
 
 ADAPTER_READY_S = 1.2  # wait after opening the port, as some slcan adapters restart then; opening takes under 2 s
-BATCH_MAX = 512  # frames per read, so that a flooded bus cannot keep the loop from its other duties
-CLOSE_WRITE_S = 1.0  # longest wait for an slcan adapter to accept the command that closes its channel
-OUTDATED_S = 0.05  # frames that the terminal of an slcan adapter has held for longer are discarded
 GATHER_S = 0.005  # frames this soon after the first are read together with it, as each wake-up costs as much as a few
 
 # Linux, include/uapi/asm-generic/socket.h; Python's socket module does not name them
@@ -53,30 +59,6 @@ SO_RXQ_OVFL = 40
 _TIMESPEC = struct.Struct("@qq")
 _DROPS = struct.Struct("@I")
 _ANCILLARY_BYTES = socket.CMSG_SPACE(_TIMESPEC.size) + socket.CMSG_SPACE(_DROPS.size)
-
-OVERFLOW = "the kernel's receive buffer was full"
-NOT_A_FRAME = "not a classic CAN frame"
-ADAPTER_LINE = "the adapter sent a line that is not a frame"
-INTERFACE_DROPS = "the interface's statistics show losses"
-
-
-class Received(NamedTuple):
-    """A frame and the kernel's receive time (nanoseconds UTC), or None if the kernel gives none."""
-
-    frame: Frame
-    kernel_utc_ns: int | None
-
-
-class Batch(NamedTuple):
-    """Frames of one read.
-
-    Attributes:
-        received: the frames, in order.
-        is_last: nothing was left to read.
-    """
-
-    received: list[Received]
-    is_last: bool
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -129,7 +111,7 @@ def open_port(config: CanLinkConfig) -> CanPort:
             port = _port(bus, config)
         except (can.CanError, OSError, ValueError, TypeError) as error:
             what = f"{config.interface} {config.channel!r}"
-            raise LinkError(config.name, f"cannot open {what}: {_message_of(error)}; {_hint(config, error)}") from error
+            raise LinkError(config.name, f"cannot open {what}: {message_of(error)}; {_hint(config, error)}") from error
         on_failure.pop_all()
         return port
 
@@ -137,7 +119,7 @@ def open_port(config: CanLinkConfig) -> CanPort:
 def _port(bus: can.BusABC, config: CanLinkConfig) -> CanPort:
     where = config.name
     if isinstance(bus, slcanBus):
-        return SlcanPort(where, bus)
+        return SlcanPort(where, bus, is_listen_only=not config.allow_transmit)
     if isinstance(bus, VirtualBus):
         return VirtualPort(where, bus)
     descriptor = socket.socket(fileno=os.dup(bus.fileno()))
@@ -145,14 +127,6 @@ def _port(bus: can.BusABC, config: CanLinkConfig) -> CanPort:
         statistics = Path("/sys/class/net") / config.channel / "statistics"
         return SocketCanPort(where, bus, descriptor, config.receive_buffer_bytes, statistics)
     return MulticastPort(where, bus, descriptor, config.receive_buffer_bytes)
-
-
-def _message_of(error: BaseException) -> str:
-    """Return the system's error text if there is one, without the repeated paths that libraries add to it."""
-    cause = error.__cause__ or error
-    if isinstance(cause, OSError) and cause.errno is not None and cause.errno > 0:
-        return os.strerror(cause.errno)
-    return str(error).strip().rstrip(".") or type(error).__name__
 
 
 def _hint(config: CanLinkConfig, error: BaseException) -> str:
@@ -164,63 +138,6 @@ def _hint(config: CanLinkConfig, error: BaseException) -> str:
     if config.interface == "slcan":
         return "check that the adapter is plugged in, that this user may access the port, and that the bitrate is right"
     return "check the channel and the options of the link"
-
-
-class CanPort(abc.ABC):
-    """An open port to a bus; python-can sends and closes. Every failure of the bus or its adapter raises LinkError."""
-
-    def __init__(self, where: str, bus: can.BusABC) -> None:
-        self._where = where
-        self._bus = bus
-        self._losses: dict[str, int] = {}
-
-    @abc.abstractmethod
-    def receive(self, timeout_s: float) -> Batch:
-        """Return up to BATCH_MAX frames; wait for at most `timeout_s` real seconds for the first."""
-
-    def fileno(self) -> int:
-        """Return the descriptor that becomes readable when a frame arrives; LinkError if there is none (`virtual`)."""
-        raise LinkError(self._where, "an in-process bus has no descriptor")
-
-    def send(self, frame: Frame) -> bool:
-        """Send one frame without waiting; return False if it was not sent because the transmit queue is full."""
-        message = can.Message(
-            arbitration_id=frame.arbitration_id,
-            data=frame.data,
-            is_extended_id=frame.is_extended,
-            is_remote_frame=frame.is_remote,
-        )
-        try:
-            self._send(message)
-        except (can.CanError, OSError) as error:
-            if _is_queue_full(error):
-                return False
-            raise self._gone(error) from error
-        return True
-
-    def losses(self) -> dict[str, int]:
-        """Return the number of frames lost since the port was opened, by reason."""
-        return dict(self._losses)
-
-    def close(self) -> None:
-        """Close the port. Never raises."""
-        with contextlib.suppress(can.CanError, OSError):
-            self._bus.shutdown()
-
-    def _send(self, message: can.Message) -> None:
-        self._bus.send(message, timeout=0.0)
-
-    def _count_lost(self, reason: str, count: int = 1) -> None:
-        self._losses[reason] = self._losses.get(reason, 0) + count
-
-    def _gone(self, error: BaseException) -> LinkError:
-        return LinkError(self._where, f"connection to the bus lost: {_message_of(error)}")
-
-
-def _is_queue_full(error: BaseException) -> bool:
-    """Return True if a frame was not sent only because the transmit queue is full."""
-    code = getattr(error.__cause__ or error, "errno", None)
-    return code in (errno.ENOBUFS, errno.EAGAIN) or str(error) == "Transmit buffer full"  # python-can's, without a code
 
 
 class _DatagramPort(CanPort):
@@ -359,61 +276,6 @@ class MulticastPort(_DatagramPort):
         return None if timestamp < 0 and timestamp in self._sent else frame
 
 
-class SlcanPort(CanPort):
-    """A serial adapter that speaks slcan (LAWICEL)."""
-
-    def __init__(self, where: str, bus: slcanBus) -> None:
-        super().__init__(where, bus)
-        self._serial = bus.serialPortOrig
-        self._serial.write_timeout = CLOSE_WRITE_S
-        self._fd = bus.fileno()
-        # Exclusive access: two readers on one port would each get half of the bytes
-        fcntl.ioctl(self._fd, termios.TIOCEXCL)
-        self._lines = SlcanLines()
-        self._unwritten = b""  # end of a line that the terminal has accepted only in part
-        self._emptied_s = time.monotonic()  # when the adapter was last seen to have taken all lines
-
-    def fileno(self) -> int:
-        return self._fd
-
-    def receive(self, timeout_s: float) -> Batch:
-        try:
-            if not select.select([self._fd], [], [], timeout_s)[0]:
-                return Batch([], True)
-            data = os.read(self._fd, 65536)
-        except OSError as error:
-            raise self._gone(error) from error
-        if not data:
-            raise LinkError(self._where, "connection to the bus lost: the adapter was unplugged; plug it in again")
-        frames = self._lines.feed(data)
-        if self._lines.malformed:
-            self._count_lost(ADAPTER_LINE, self._lines.malformed)
-            self._lines.malformed = 0
-        return Batch([Received(frame, None) for frame in frames], not more_may_wait(data))
-
-    def _send(self, message: can.Message) -> None:
-        """Write the frame's line without waiting; python-can waits, however long, until the adapter has taken it.
-
-        Lines that the adapter has not taken in time are discarded, as they would be outdated when it goes on.
-        """
-        if not self._serial.out_waiting:
-            self._emptied_s = time.monotonic()
-        elif time.monotonic() - self._emptied_s > OUTDATED_S:
-            fcntl.ioctl(self._fd, termios.TCFLSH, termios.TCOFLUSH)
-            self._unwritten = b"\r"  # ends a line of which the adapter has taken a part
-            raise BlockingIOError(errno.EAGAIN, os.strerror(errno.EAGAIN))
-        self._unwritten = self._unwritten[os.write(self._fd, self._unwritten) :]
-        if self._unwritten:
-            raise BlockingIOError(errno.EAGAIN, os.strerror(errno.EAGAIN))
-        line = slcan_line(_frame(message))
-        self._unwritten = line[os.write(self._fd, line) :]
-
-    def close(self) -> None:
-        super().close()
-        with contextlib.suppress(OSError):
-            self._serial.close()  # python-can leaves it open when the adapter is gone
-
-
 class VirtualPort(CanPort):
     """python-can's in-process bus, for tests and for simulators in the same process."""
 
@@ -431,19 +293,9 @@ class VirtualPort(CanPort):
                 if message.is_fd or len(message.data) > DATA_MAX:
                     self._count_lost(NOT_A_FRAME)
                 else:
-                    received.append(Received(_frame(message), None))
+                    received.append(Received(frame_of(message), None))
                 if len(received) >= BATCH_MAX:
                     is_last = False
                     break
                 message = take()
         return Batch(received, is_last)
-
-
-def _frame(message: can.Message) -> Frame:
-    return Frame(
-        message.arbitration_id,
-        bytes(message.data),
-        message.is_extended_id and not message.is_error_frame,
-        message.is_remote_frame,
-        message.is_error_frame,
-    )

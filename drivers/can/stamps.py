@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from drivers.can.ports import Batch
+from drivers.can.port import Batch
 from drivers.clock import Clock, Stamp
 
 EXACT_NS = 1_000_000

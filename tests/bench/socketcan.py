@@ -30,7 +30,8 @@ from typing import Any
 import can
 import numpy as np
 
-from drivers.can.ports import OVERFLOW, CanLinkConfig
+from drivers.can.port import OVERFLOW
+from drivers.can.ports import CanLinkConfig
 from drivers.can_link import CanLink
 from drivers.clock import SystemClock
 from drivers.logs.can_log import read_can_log

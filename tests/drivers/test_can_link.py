@@ -10,14 +10,10 @@ import can
 import pytest
 
 from drivers import outage
+from drivers.can import slcan_port
 from drivers.can.frame import Frame
-from drivers.can.ports import (
-    ADAPTER_READY_S,
-    BATCH_MAX,
-    CanLinkConfig,
-    Interface,
-    open_port,
-)
+from drivers.can.port import BATCH_MAX
+from drivers.can.ports import ADAPTER_READY_S, CanLinkConfig, Interface, open_port
 from drivers.can_link import LOSS_CHECK_NS, CanLink
 from drivers.canopen.sync import SyncProducer
 from drivers.clock import ManualClock, ScaledClock, Stamp, SystemClock
@@ -324,6 +320,35 @@ def test_an_slcan_adapter_sends_what_it_may(adapter: Adapter) -> None:
     with running(slcan_link(adapter, allow_transmit=True, sync_period_ms=1000.0)) as heard:
         heard.wait(lambda: heard.sent, "a SYNC")
         assert b"O\r" in adapter.commands(b"t0800\r")
+
+
+@pytest.mark.parametrize(("may_send", "command"), [(False, b"L\r"), (True, b"O\r")])
+def test_a_channel_that_an_slcan_adapter_has_closed_is_opened_again_after_a_silence(
+    adapter: Adapter, monkeypatch: pytest.MonkeyPatch, *, may_send: bool, command: bytes
+) -> None:
+    monkeypatch.setattr(slcan_port, "SILENT_S", 0.2)
+    with running(slcan_link(adapter, allow_transmit=may_send)) as heard:
+        heard.wait_for(EventKind.LINK_UP)
+        adapter.waiting()
+        assert adapter.commands(command) == command
+        adapter.send(b"\r")
+        assert adapter.commands(command) == command, "and again, as it may have been refused unheard"
+        adapter.send(b"\at1A01AA\r")
+        heard.wait(lambda: heard.received, "a frame")
+    assert not heard.events(EventKind.FRAMES_DROPPED)
+
+
+def test_an_slcan_adapter_that_refuses_frames_is_told_to_open_its_channel_and_warned_about(adapter: Adapter) -> None:
+    with running(slcan_link(adapter, allow_transmit=True, sync_period_ms=20.0)) as heard:
+        heard.wait_for(EventKind.LINK_UP)
+        adapter.waiting()
+        told = b""
+        while not heard.events(EventKind.WARNING) or b"O\r" not in told:
+            told += (new := adapter.waiting())
+            adapter.send(b"\a" * new.count(b"\r"))
+        assert "the adapter refuses frames" in heard.wait_for(EventKind.WARNING).text
+        adapter.send(b"\r")
+        assert heard.wait_for(EventKind.WARNING, 2).code == 0, "it is withdrawn once nothing is refused"
 
 
 def test_an_adapter_that_is_unplugged_and_plugged_in_again_is_found_again(adapter: Adapter) -> None:

@@ -17,7 +17,8 @@ import serial
 from can.interfaces.virtual import VirtualBus
 
 from drivers.can.frame import Frame
-from drivers.can.ports import CanLinkConfig, CanPort, SocketCanPort, open_port
+from drivers.can.port import CanPort
+from drivers.can.ports import CanLinkConfig, SocketCanPort, open_port
 from drivers.can_link import CanLink
 from drivers.clock import ScaledClock, SystemClock
 from drivers.errors import LinkError
@@ -90,7 +91,7 @@ def test_a_full_transmit_queue_is_one_warning_and_the_link_goes_on_reading(
     with running(sending_link()) as heard:
         heard.wait(lambda: len(heard.received) == WAITING, "the frames that arrived meanwhile")
         begun = heard.wait_for(EventKind.WARNING)
-        assert begun.text.startswith("boom: the transmit queue is full, so frames are not sent: check that ")
+        assert begun.text.startswith("boom: the transmit queue is full or the adapter refuses frames, so they are not ")
         assert begun.code is None
         assert heard.sent == []
         assert bus.timeout == 0.0, "nothing is read while it waits to send"
@@ -98,7 +99,7 @@ def test_a_full_transmit_queue_is_one_warning_and_the_link_goes_on_reading(
         heard.wait(lambda: heard.sent, "a SYNC")
         ended = heard.wait_for(EventKind.WARNING, 2)
         assert ended.code == 0, "withdraws the warning"
-        assert "frames were not sent while the transmit queue was full" in ended.text
+        assert "frames were not sent as the queue was full" in ended.text
     assert len(heard.events(EventKind.WARNING)) == 2
     assert heard.events(EventKind.LINK_LOST) == heard.gaps == []
 

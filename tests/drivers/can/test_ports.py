@@ -14,16 +14,8 @@ import can
 import pytest
 
 from drivers.can.frame import Frame
-from drivers.can.ports import (
-    INTERFACE_DROPS,
-    NOT_A_FRAME,
-    OVERFLOW,
-    CanLinkConfig,
-    MulticastPort,
-    SocketCanPort,
-    interface_drops,
-    open_port,
-)
+from drivers.can.port import INTERFACE_DROPS, NOT_A_FRAME, OVERFLOW
+from drivers.can.ports import CanLinkConfig, MulticastPort, SocketCanPort, interface_drops, open_port
 from drivers.can_link import CanLink
 from drivers.clock import ScaledClock, SystemClock
 from drivers.errors import LinkError

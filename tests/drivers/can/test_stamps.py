@@ -12,7 +12,8 @@ import can
 import pytest
 
 from drivers.can.frame import Frame
-from drivers.can.ports import BATCH_MAX, Batch, CanLinkConfig, MulticastPort, Received, SocketCanPort
+from drivers.can.port import BATCH_MAX, Batch, Received
+from drivers.can.ports import CanLinkConfig, MulticastPort, SocketCanPort
 from drivers.can.stamps import ReceiveStamps
 from drivers.can_link import CanLink
 from drivers.clock import NS_PER_S, Stamp, SystemClock
