@@ -37,9 +37,9 @@ from calibration.gap.unknown_inputs import (
     Unknowns,
     filled_in,
     implausible_runs,
-    of_any_size,
     unknown_inputs,
     unknowns_of_any_size,
+    widened,
     with_doubt,
     with_unknowns,
     with_warning,
@@ -116,7 +116,9 @@ def _with_unknowns(problem: Problem, families: Collection[str]) -> _Given:
     doubted = _lacking(plain.joint.effects, plain)
     if not doubted:
         return plain, None
-    return replace(sized[0], adopted=with_doubt(sized[0].adopted, doubted)), of_any_size(sized[1], problem.solution)
+    return replace(sized[0], adopted=with_doubt(sized[0].adopted, doubted)), widened(
+        sized[1], problem.solution.chain.rig
+    )
 
 
 def _given(problem: Problem, families: Collection[str], unknowns: Unknowns) -> tuple[SearchResult, Unknowns]:
@@ -128,7 +130,7 @@ def _given(problem: Problem, families: Collection[str], unknowns: Unknowns) -> t
 def _with_any_size(problem: Problem, families: Collection[str]) -> tuple[SearchResult, Unknowns] | None:
     """Return the effects that samples with all inputs show, or else with one input; None if no inputs are lacking."""
     found = None
-    for unknowns in _of_any_size(problem, families):
+    for unknowns in _each_any_size(problem, families):
         found = _given(problem, families, unknowns)
         if _lack_inputs(found[0]):
             break
@@ -169,27 +171,29 @@ def _without_implausible(
     effects, samples = _lack_inputs(found), problem.solution.samples
     implausible = implausible_runs(found.joint, unknowns)
     if not len(implausible):
-        return found, of_any_size(unknowns, problem.solution)
+        return found, widened(unknowns, problem.solution.chain.rig)
     fewer = unknown_inputs(effects, found.joint.context, samples, implausible.names)
     if fewer is not None:
         tried, _ = _given(problem, families, fewer)
         if _names_more(tried, found, len(implausible)):
             return tried, fewer
     told = with_warning(found.adopted, effects, implausible, samples)
-    return replace(found, adopted=told), of_any_size(unknowns, problem.solution)
+    return replace(found, adopted=told), widened(unknowns, problem.solution.chain.rig)
 
 
-def _of_any_size(problem: Problem, families: Collection[str]) -> Iterator[Unknowns]:
+def _each_any_size(problem: Problem, families: Collection[str]) -> Iterator[Unknowns]:
     """Yield the unknowns of any size of all samples that lack inputs.
 
     Then yield those of one input after the other, where so many inputs are lacking that few rows have all.
     """
     context, samples = problem.kinematics_only().context, problem.solution.samples
     effects = list(partly_lacking(context, families))
+    if not effects:
+        return
     known = np.array([library()[name].known(context, where) for name, where in effects])
-    inputs = np.unique(known, axis=0, return_inverse=True)[1].reshape(-1) if effects else np.empty(0)
+    inputs = np.unique(known, axis=0, return_inverse=True)[1].reshape(-1)
     together = [effects]
-    if effects and known.all(axis=0).mean() < _LEAST_COMPLETE and inputs.max() < _MOST_INPUTS:
+    if known.all(axis=0).mean() < _LEAST_COMPLETE and inputs.max() < _MOST_INPUTS:
         together += [
             [effect for effect, own in zip(effects, inputs, strict=True) if own == number]
             for number in range(inputs.max() + 1)

@@ -27,6 +27,7 @@ from calibration.identification.refinement import Prior, refine
 from calibration.identification.samples import Samples
 from calibration.identification.solve import Solution
 from calibration.observations import Floats, Observations, Strings
+from calibration.rig.description import Rig
 
 _LEAST_STANDSTILLS = 3  # of a run
 _MOST_RUNS = 20  # of samples that lack inputs of effects at one joint; more make the fit slow
@@ -98,34 +99,35 @@ def unknowns_of_any_size(
         context: of the rows.
         samples: made from these rows.
     """
-    by_joint, along_axes_mm2 = np.zeros((len(context), len(context.chain.joint_index))), np.zeros(len(context))
+    chain = context.chain
+    at_joints, at_prisms = np.zeros((len(context), len(chain.joint_index))), np.zeros(len(context))
     for name, where in effects:
         family = library()[name]
         lacks = ~family.known(context, where)
         if isinstance(family, JointFamily):
-            by_joint[lacks, context.chain.joint_index[where]] = _ANY_SIZE[family.kind] ** 2
+            at_joints[lacks, chain.joint_index[where]] = 1.0
         else:
-            along_axes_mm2[lacks] = _ANY_SIZE_MM**2
-    if not (by_joint.any() or along_axes_mm2.any()):
+            at_prisms[lacks] = 1.0
+    if not (at_joints.any() or at_prisms.any()):
         return None
-    runs = joined([], len(samples))
-    return Unknowns(runs, samples.average(by_joint), samples.average(along_axes_mm2), np.empty(0))
+    return _of_any_size(samples.average(at_joints), samples.average(at_prisms), chain.rig)
 
 
-def of_any_size(unknowns: Unknowns, solution: Solution) -> Unknowns:
+def widened(unknowns: Unknowns, rig: Rig) -> Unknowns:
     """Return unknown displacements of any size of the same samples.
 
     Args:
-        unknowns: as returned by `unknown_inputs`.
-        solution: the solution whose samples have them.
+        unknowns: result of `unknown_inputs`.
+        rig: rig of the samples.
     """
-    sizes = np.array([_ANY_SIZE[joint.kind] for joint in solution.chain.rig.joints])
-    return Unknowns(
-        joined([], len(solution.samples)),
-        np.where(unknowns.variance > 0.0, sizes**2, 0.0),
-        np.where(unknowns.along_axes_mm2 > 0.0, _ANY_SIZE_MM**2, 0.0),
-        np.empty(0),
-    )
+    at_joints, at_prisms = (own > 0.0 for own in (unknowns.variance, unknowns.along_axes_mm2))
+    return _of_any_size(at_joints.astype(np.float64), at_prisms.astype(np.float64), rig)
+
+
+def _of_any_size(at_joints: Floats, at_prisms: Floats, rig: Rig) -> Unknowns:
+    """Return unknowns of any size; (m, joints) and (m,) shares of each sample that lack inputs at joints and prisms."""
+    sizes = np.array([_ANY_SIZE[joint.kind] for joint in rig.joints])
+    return Unknowns(joined([], len(at_prisms)), at_joints * sizes**2, at_prisms * _ANY_SIZE_MM**2, np.empty(0))
 
 
 def unknown_inputs(

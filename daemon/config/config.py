@@ -230,8 +230,7 @@ def _sentence(error: ErrorDetails) -> str:
     if error["loc"][-1:] == ("webhook_url",):  # it may hold a secret
         return f"{key}: {message}"
     found = error["input"]
-    if isinstance(found, dict) or (
-        isinstance(found, str) and repr(found) in message
-    ):  # the message names what is wrong
+    is_named = isinstance(found, str) and repr(found) in message
+    if is_named or isinstance(found, dict):  # of a whole table the message names what is wrong in it
         return f"{key}: {message}"
     return f"{key}: {message}, found {as_toml(found)}"

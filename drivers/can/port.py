@@ -67,7 +67,7 @@ class CanPort(abc.ABC):
         try:
             self._send(message)
         except (can.CanError, OSError) as error:
-            if is_queue_full(error):
+            if _is_queue_full(error):
                 return False
             raise self._gone(error) from error
         return True
@@ -91,7 +91,7 @@ class CanPort(abc.ABC):
         return LinkError(self._where, f"connection to the bus lost: {message_of(error)}")
 
 
-def is_queue_full(error: BaseException) -> bool:
+def _is_queue_full(error: BaseException) -> bool:
     """Return True if a frame was not sent only because the transmit queue is full."""
     code = getattr(error.__cause__ or error, "errno", None)
     return code in (errno.ENOBUFS, errno.EAGAIN) or str(error) == "Transmit buffer full"  # python-can's, without a code

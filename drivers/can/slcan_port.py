@@ -92,7 +92,8 @@ class SlcanPort(CanPort):
         """Open the adapter's channel, unless commands still wait for the adapter."""
         self._heard_s = time.monotonic()
         if not self._unwritten and not self._serial.out_waiting:
-            self._is_asked = os.write(self._fd, self._open_command) > 0
+            os.write(self._fd, self._open_command)
+            self._is_asked = True
 
     def close(self) -> None:
         super().close()

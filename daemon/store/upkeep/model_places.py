@@ -39,12 +39,9 @@ def follow_moved_models(store: Store, models: Path) -> None:
         place = place_of_model(row["path"])
         if place is None or Path(row["path"]) == models / place or not (models / place).is_dir():
             continue
-        before, now = (json.dumps(str(own)) for own in (_directory_of_job(row["path"], place), models / place.parts[0]))
+        earlier = Path(row["path"]).parents[len(place.parts) - 1]  # the directory of all models
+        before, now = (json.dumps(str(own / place.parts[0]))[1:-1] for own in (earlier, models))
         with store.transaction() as db:
             db.execute("UPDATE models SET path = ? WHERE path = ?", [str(models / place), row["path"]])
-            db.execute("UPDATE jobs SET result_json = replace(result_json, ?, ?)", [before[1:-1], now[1:-1]])
+            db.execute("UPDATE jobs SET result_json = replace(result_json, ?, ?)", [before, now])
         log.warning("the model in %s is now in %s", row["path"], models / place)
-
-
-def _directory_of_job(path: str, place: Path) -> Path:
-    return Path(path).parents[len(place.parts) - 2] if len(place.parts) > 1 else Path(path)
