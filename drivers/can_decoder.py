@@ -13,7 +13,7 @@ from drivers.canopen.cia301 import Service, classify, sdo_request_id
 from drivers.canopen.node_setup import NodeSetup
 from drivers.canopen.pdo_channel import PdoChannelDecoder
 from drivers.canopen.supervision import NodeSupervision
-from drivers.canopen.sync import SYNC_ID, SyncSampling
+from drivers.canopen.sync import SYNC_ID, Sync, SyncSampling
 from drivers.clock import NS_PER_S, Stamp
 from drivers.readings import CanCapture, Capture, DeviceEvent, Gap, GapReason, Record
 
@@ -49,7 +49,7 @@ class CanDecoder:
         self._nodes: list[NodeSupervision] = []
         self._requests: dict[int, NodeSupervision] = {}  # by the identifier of SDO requests to the node
         self._bus_errors = BusErrors(link)
-        self._sync: Stamp | None = None
+        self._sync: Sync | None = None
         self._started = False
         nodes: dict[int, list[PdoChannelDecoder]] = {}
         for decoder in channels:
@@ -66,6 +66,9 @@ class CanDecoder:
             self._requests[sdo_request_id(node)] = supervision
             for arbitration_id, handler in supervision.handlers.items():
                 self._entry(arbitration_id, False).handler = handler
+            for channel in decoders:
+                if channel.is_synchronous:
+                    self._entry(channel.arbitration_id, channel.is_extended).node = supervision
 
     @property
     def channels(self) -> frozenset[str]:
@@ -93,7 +96,8 @@ class CanDecoder:
             return self._bus_errors.feed(stamp, capture.arbitration_id, capture.data)
         key = capture.arbitration_id
         if key == SYNC_ID and not capture.is_extended:
-            self._sync = stamp  # including rigcal's own SYNC: it marks an instant and is not a reading
+            # Including rigcal's own SYNC: it marks an instant and is not a reading
+            self._sync = Sync(stamp) if self._sync is None else self._sync.next(stamp)
         if capture.is_extended:
             key |= _EXTENDED
         if capture.is_transmitted:
@@ -108,6 +112,8 @@ class CanDecoder:
         if entry.is_unknown or capture.is_remote:
             return ()
         records: list[Record] = []
+        if entry.node is not None:
+            records += entry.node.on_synchronous_pdo(key, stamp, self._sync, capture.data)
         for channel in entry.channels:
             channel.decode(stamp, self._sync, capture.data, records)
         if entry.handler is not None:
@@ -164,11 +170,12 @@ class CanDecoder:
 class _Entry:
     """One identifier."""
 
-    __slots__ = ("channels", "count", "handler", "is_unknown", "last_seen")
+    __slots__ = ("channels", "count", "handler", "is_unknown", "last_seen", "node")
 
     def __init__(self) -> None:
         self.channels: tuple[_ChannelState, ...] = ()
         self.handler: Callable[[Stamp, bytes], list[Record]] | None = None
+        self.node: NodeSupervision | None = None  # of a synchronous PDO
         self.is_unknown = True
         self.count = 0
         self.last_seen: Stamp | None = None
@@ -216,7 +223,7 @@ class _ChannelState:
     def missed_frames(self) -> int | None:
         return self._decoder.missed_frames
 
-    def decode(self, stamp: Stamp, sync: Stamp | None, data: bytes, records: list[Record]) -> None:
+    def decode(self, stamp: Stamp, sync: Sync | None, data: bytes, records: list[Record]) -> None:
         sampled = stamp if self._sampling is None else self._sampling.instant(stamp, sync)
         decoded = self._decoder.decode(sampled, data)
         if not decoded:

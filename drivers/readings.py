@@ -65,7 +65,7 @@ class Status(StrEnum):
     OK = "ok"
     NOT_AVAILABLE = "not_available"  # the device itself sent "no value" (all ones, Exxx, distance 0)
     OUT_OF_RANGE = "out_of_range"  # outside the device's measuring range or the signal's declared range
-    DEVICE_ALARM = "device_alarm"  # an alarm (6503h, EMCY) makes the value invalid, or a set-up found a wrong device
+    DEVICE_ALARM = "device_alarm"  # an alarm (6503h, EMCY), a wrong device or a duplicate node makes the value invalid
     MALFORMED = "malformed"  # received but could not be decoded; a DecodeFailure gives the reason
     TIME_DOUBTFUL = "time_doubtful"  # valid, but read late, so the time of measurement is unknown
 
@@ -162,6 +162,8 @@ class EventKind(StrEnum):
     NMT_STATE = "nmt_state"
     HEARTBEAT_LOST = "heartbeat_lost"
     HEARTBEAT_RESTORED = "heartbeat_restored"
+    DUPLICATE_NODE = "duplicate_node"  # a second device on the bus has the number of a node
+    DUPLICATE_NODE_GONE = "duplicate_node_gone"
     EMERGENCY = "emergency"
     EMERGENCY_CLEARED = "emergency_cleared"
     ALARM = "alarm"

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Generator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Literal
 
 from drivers.can.frame import Frame
 from drivers.canopen.cia301 import NmtCommand, NmtState, encode_nmt, heartbeat_id, sdo_request_id, sdo_response_id
 from drivers.canopen.cia404 import UNIT_TEXTS
 from drivers.canopen.cia406 import ALARMS, WARNINGS
+from drivers.canopen.findings import Findings, MismatchError
 from drivers.canopen.pdo import (
     COB_ID_DISABLED,
     COB_ID_EXTENDED,
@@ -22,7 +23,15 @@ from drivers.canopen.pdo import (
     TPDO_MAPPING,
     TransmitPdo,
 )
-from drivers.canopen.sdo import NO_SUCH_OBJECT, NO_SUCH_SUBINDEX, Download, SdoAbortError, SdoExchange, Transfer, Upload
+from drivers.canopen.sdo import (
+    NO_SUCH_OBJECT,
+    NO_SUCH_SUBINDEX,
+    Download,
+    SdoAbortError,
+    SdoExchange,
+    Transfer,
+    Upload,
+)
 from drivers.clock import NS_PER_S, Stamp
 from drivers.errors import DeviceError
 from drivers.readings import DeviceEvent, EventKind
@@ -79,23 +88,6 @@ class NodeSetup:
         return f"{self.name} (node {self.node})"
 
 
-class MismatchError(DeviceError):
-    """The node is not the expected one."""
-
-
-@dataclass
-class Findings:
-    """What the set-up of a node has found so far.
-
-    Attributes:
-        serial_number: object 1018h.4; None if it was not read, does not exist or is 0.
-        warnings: values that could not be verified.
-    """
-
-    serial_number: int | None = None
-    warnings: list[str] = field(default_factory=list)
-
-
 _Step = Transfer | NmtCommand
 Script = Generator[_Step, bytes, str]
 
@@ -141,6 +133,7 @@ class SetupRunner:
             return
         exchange = self._exchange
         try:
+            self._found.check_identity(self._setup.where, frame.data)
             if exchange.feed(frame.data):
                 self._attempt = 0
                 self._request(self._setup, now)
@@ -289,7 +282,7 @@ def setup_script(setup: NodeSetup, found: Findings) -> Script:
 
 
 def _identify(setup: NodeSetup, found: Findings) -> Script:
-    device_type = _unsigned((yield Upload(DEVICE_TYPE, 0)))
+    device_type = found.identity[DEVICE_TYPE, 0] = _unsigned((yield Upload(DEVICE_TYPE, 0)))
     if device_type & 0xFFFF != setup.profile:
         raise MismatchError(
             setup.where,
@@ -297,7 +290,7 @@ def _identify(setup: NodeSetup, found: Findings) -> Script:
         )
     parts = [f"device type {device_type:08X}h"]
     for subindex, text in ((1, "vendor"), (2, "product"), (3, "revision"), (4, "serial number")):
-        number = yield from _optional(0x1018, subindex)
+        number = found.identity[0x1018, subindex] = yield from _optional(0x1018, subindex)
         if number is not None:
             parts.append(f"{text} {number:X}h")
     found.serial_number = number or None  # that of the last sub-index

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import re
 
+from drivers.canopen.findings import Findings, MismatchError
 from drivers.canopen.node_setup import (
     ANSWER_TIMEOUT_NS,
     ATTEMPTS,
     DEVICE_TYPE,
     NOT_USED,
-    Findings,
-    MismatchError,
     NodeSetup,
     Script,
     next_transfer,
@@ -67,6 +66,7 @@ class SetupWatch:
         if exchange is None or stamp.since(self._requested) > ATTEMPTS * ANSWER_TIMEOUT_NS:
             return None
         try:
+            self._found.check_identity(self._setup.where, data)
             exchange.feed(data)
         except DeviceError as error:
             return self._step(error)

@@ -6,11 +6,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from drivers.canopen.cia301 import NmtState, decode_heartbeat, emcy_id, heartbeat_id, sdo_response_id
+from drivers.canopen.duplicate_node import DuplicateNodeWatch
 from drivers.canopen.emcy import decode_emergency
 from drivers.canopen.node_setup import NodeSetup
 from drivers.canopen.pdo_channel import PdoChannelDecoder
 from drivers.canopen.sdo import UploadResponse, decode_response
 from drivers.canopen.setup_watch import SetupWatch
+from drivers.canopen.sync import Sync
 from drivers.clock import NS_PER_S, Stamp
 from drivers.readings import DecodeFailure, DeviceEvent, EventKind, Record
 
@@ -42,6 +44,9 @@ class NodeSupervision:
     succeeds. If the serial number that it reads is not the one read last, the zeros of the node's joints count as lost,
     whether the set-up succeeds or not.
 
+    Two devices with the node's number make the values invalid, too, if they are noticed: see DuplicateNodeWatch for
+    synchronous PDOs, and `setup_script` for what a set-up reads.
+
     Args:
         node: node number.
         channels: decoders of the channels that the node feeds, at least one; events use the first one's name.
@@ -54,6 +59,9 @@ class NodeSupervision:
         self._name = channels[0].name
         self._setups = None if setup is None else SetupWatch(setup)
         self._has_failed = False  # by an emergency
+        self._is_synchronous = any(channel.is_synchronous for channel in channels)
+        self._is_duplicate = False
+        self._duplicates: dict[int, DuplicateNodeWatch] = {}  # by the key of a PDO's identifier
         self._state: NmtState | None = None
         self._heartbeat: Stamp | None = None
         self._is_lost = False
@@ -98,12 +106,14 @@ class NodeSupervision:
             self._restarted()
         elif event.kind is EventKind.EMERGENCY_CLEARED:
             self._has_failed = False
-        elif event.kind is EventKind.EMERGENCY and event.text.endswith(VOIDS):
-            self._has_failed = True
-        elif event.kind in (EventKind.HEARTBEAT_LOST, EventKind.HEARTBEAT_RESTORED):
-            if not self._timeout_ns:
-                return []
+        elif event.kind is EventKind.EMERGENCY:
+            self._has_failed |= event.text.endswith(VOIDS)
+        elif event.kind in (EventKind.HEARTBEAT_LOST, EventKind.HEARTBEAT_RESTORED) and self._timeout_ns:
             self._is_lost = event.kind is EventKind.HEARTBEAT_LOST
+        elif event.kind in (EventKind.DUPLICATE_NODE, EventKind.DUPLICATE_NODE_GONE) and self._is_synchronous:
+            self._is_duplicate = event.kind is EventKind.DUPLICATE_NODE
+        else:
+            return []
         self._mark()
         return [replace(event, device=self._name)]
 
@@ -121,6 +131,33 @@ class NodeSupervision:
         text = f"node {self.node}: no heartbeat for {self._timeout_ns / NS_PER_S:g} s; check its power and cable"
         # Timestamped with the deadline, so that the time of the call does not matter
         return [DeviceEvent(self._name, heartbeat.shifted(self._timeout_ns), EventKind.HEARTBEAT_LOST, text)]
+
+    def on_synchronous_pdo(self, pdo: int, stamp: Stamp, sync: Sync | None, data: bytes) -> list[Record]:
+        """Return an event if two devices begin or cease to send a PDO after each SYNC.
+
+        Args:
+            pdo: what distinguishes the PDO from others of the node.
+            stamp: when it was received.
+            sync: the last SYNC; None if there was none.
+            data: its data.
+        """
+        watch = self._duplicates.get(pdo)
+        if watch is None:
+            watch = self._duplicates[pdo] = DuplicateNodeWatch(self._is_duplicate)
+        watch.feed(stamp, sync, data)
+        is_duplicate = any(watch.is_duplicate for watch in self._duplicates.values())
+        if is_duplicate == self._is_duplicate:
+            return []
+        self._is_duplicate = is_duplicate
+        self._mark()
+        if not is_duplicate:
+            text = f"node {self.node}: a single value arrives after each SYNC again"
+            return [DeviceEvent(self._name, stamp, EventKind.DUPLICATE_NODE_GONE, text)]
+        text = (
+            f"node {self.node}: different values arrive after the same SYNC, as if two devices had this node number; "
+            "neither is used until a single one arrives"
+        )
+        return [DeviceEvent(self._name, stamp, EventKind.DUPLICATE_NODE, text)]
 
     def _on_heartbeat(self, stamp: Stamp, data: bytes) -> list[Record]:
         try:
@@ -173,7 +210,8 @@ class NodeSupervision:
 
     def _mark(self) -> None:
         """Tell the channels whether the node's values are valid."""
-        is_void = self._has_failed or (self._setups is not None and self._setups.is_mismatched)
+        is_wrong = self._setups is not None and self._setups.is_mismatched
+        is_void = self._has_failed or self._is_duplicate or is_wrong
         for channel in self._channels:
             channel.is_void = is_void
 

@@ -2,12 +2,33 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 from drivers.can.frame import Frame
 from drivers.clock import NS_PER_S, Stamp
 
 SYNC_ID = 0x080
 SYNC_WINDOW_NS = NS_PER_S // 10
 """Longest time from a SYNC to a PDO sampled at it; ten nodes at 20 kbit/s need 60 ms."""
+
+
+@dataclass(frozen=True, slots=True)
+class Sync:
+    """A SYNC on the bus.
+
+    Attributes:
+        stamp: when it was sent or received.
+        number: number of SYNCs before it.
+        interval_ns: time since the one before it; None for the first one.
+    """
+
+    stamp: Stamp
+    number: int = 0
+    interval_ns: int | None = None
+
+    def next(self, stamp: Stamp) -> Sync:
+        """Return the SYNC that follows this one at `stamp`."""
+        return Sync(stamp, self.number + 1, stamp.since(self.stamp))
 
 
 class SyncProducer:
@@ -37,17 +58,18 @@ class SyncSampling:
     """Finds when a synchronous channel was sampled: the first PDO after a SYNC was sampled at that SYNC."""
 
     def __init__(self) -> None:
-        self._used: Stamp | None = None
+        self._used: Sync | None = None
 
-    def instant(self, stamp: Stamp, sync: Stamp | None) -> Stamp:
+    def instant(self, stamp: Stamp, sync: Sync | None) -> Stamp:
         """Return when the values of a PDO were sampled.
 
         Args:
             stamp: when the PDO was received.
-            sync: when the last SYNC was sent or received; None if there was none.
+            sync: the last SYNC; None if there was none.
         """
         if sync is None or sync is self._used:
             return stamp
         self._used = sync
-        is_sampled = 0 <= stamp.since(sync) <= SYNC_WINDOW_NS and not (stamp.is_doubtful or sync.is_doubtful)
-        return sync if is_sampled else stamp
+        sampled = sync.stamp
+        is_sampled = 0 <= stamp.since(sampled) <= SYNC_WINDOW_NS and not (stamp.is_doubtful or sampled.is_doubtful)
+        return sampled if is_sampled else stamp

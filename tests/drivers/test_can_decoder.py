@@ -291,6 +291,11 @@ def test_what_a_node_told_holds_when_its_channel_is_renamed(told: str) -> None:
     assert the_reading(feed(renamed, "1A0 00 40 00 00")).status is Status.DEVICE_ALARM
 
 
+def test_an_emergency_that_leaves_the_values_valid_is_recalled_too() -> None:
+    (told,) = events(feed(decoder(), "0A0 20 81 11 00 00 00 00 00"))
+    assert decoder().recall([told]) == [told]
+
+
 def test_a_heartbeat_that_is_expected_no_more_is_not_missed() -> None:
     lost = DeviceEvent("theta1", at(0), EventKind.HEARTBEAT_LOST, "node 32: no heartbeat for 2.5 s")
     assert decoder(heartbeat_ms=0).recall([lost]) == []

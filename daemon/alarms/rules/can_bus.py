@@ -58,6 +58,22 @@ def heartbeat_lost(evidence: Evidence) -> Iterator[Finding]:
             yield event.device, event.text
 
 
+@rule(
+    "critical",
+    "Give one of the two devices a different node number. If there is only one, it sends more often than at SYNC: run "
+    "`rigcal devices configure`, or let whoever sets it up change its transmission type to 1.",
+)
+def duplicate_node(evidence: Evidence) -> Iterator[Finding]:
+    """Two devices on a CAN bus send values under the same CANopen node number.
+
+    Different values arrive after the same SYNC, and neither is used. The alarm survives a restart of the daemon.
+    Cleared when a single value has arrived after each of ten SYNCs.
+    """
+    for event in evidence.active_events(EventKind.DUPLICATE_NODE, EventKind.DUPLICATE_NODE_GONE):
+        if not evidence.is_cut_off(event.device):
+            yield event.device, event.text
+
+
 @rule("critical", "Look up the code in the device's manual. If it gives no other remedy, switch the device off and on.")
 def emergency(evidence: Evidence) -> Iterator[Finding]:
     """A CANopen node has sent an emergency (EMCY) and has not withdrawn it.

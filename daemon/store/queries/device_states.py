@@ -1,4 +1,4 @@
-"""The last reports on the states of CANopen devices: emergencies, alarms, boot-ups, heartbeats, set-ups."""
+"""The last reports on the states of CANopen devices: emergencies, alarms, boot-ups, heartbeats, set-ups, duplicates."""
 
 from __future__ import annotations
 
@@ -14,6 +14,8 @@ from drivers.readings import DeviceEvent, EventKind
 STATES = (
     EventKind.ALARM,
     EventKind.BOOT_UP,
+    EventKind.DUPLICATE_NODE,
+    EventKind.DUPLICATE_NODE_GONE,
     EventKind.EMERGENCY,
     EventKind.EMERGENCY_CLEARED,
     EventKind.HEARTBEAT_LOST,

@@ -155,6 +155,14 @@ def test_captures_that_are_decoded_again_are_as_void_as_they_were(store: Store, 
     assert set(statuses(store)) == {"device_alarm"}
 
 
+def test_a_second_device_of_a_node_is_known_until_it_is_gone(store: Store) -> None:
+    found = DeviceEvent("theta1", at(1), EventKind.DUPLICATE_NODE, "node 32: different values arrive")
+    gone = DeviceEvent("theta1", at(2), EventKind.DUPLICATE_NODE_GONE, "node 32: a single value arrives")
+    store.insert_records([found, gone])
+    assert device_states(store, at(1.5)) == [found]
+    assert device_states(store, at(3)) == [found, gone]
+
+
 def test_of_a_storm_the_last_event_and_the_last_that_voids_are_told(store: Store) -> None:
     void = DeviceEvent("theta1", at(1), EventKind.EMERGENCY, f"node 32: broken; {VOIDS}", 0x5000)
     storm = [

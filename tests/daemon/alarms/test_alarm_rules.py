@@ -179,6 +179,18 @@ CASES: dict[str, list[tuple[Evidence, list[str], Evidence]]] = {
             known(event(E.HEARTBEAT_LOST, "theta1"), channels=[SILENT, channel(name="theta3")]),
         ),
     ],
+    "duplicate_node": [
+        (
+            known(event(E.DUPLICATE_NODE, "theta1")),
+            ["theta1"],
+            known(event(E.DUPLICATE_NODE, "theta1"), event(E.DUPLICATE_NODE_GONE, "theta1", 2)),
+        ),
+        (
+            known(event(E.DUPLICATE_NODE, "theta1")),
+            ["theta1"],
+            known(event(E.DUPLICATE_NODE, "theta1"), links=[link(False)]),
+        ),
+    ],
     "emergency": [
         (
             known(event(E.EMERGENCY, "theta1", code=0x5000)),

@@ -35,10 +35,11 @@ class Bus:
         self.boom = boom or decoder()
         self.now = START
 
-    def set_up(self, node: Node, plc_after: int = 0) -> list[DeviceEvent]:
+    def set_up(self, node: Node, plc_after: int = 0, second: Node | None = None) -> list[DeviceEvent]:
         """Return the events of a set-up and then those that the decoder made of its frames.
 
-        Another master reads object 1000h after the request of number `plc_after`.
+        Another master reads object 1000h after the request of number `plc_after`. A second device with the node's
+        number answers after the node.
         """
         runner = SetupRunner()
         runner.add(setup())
@@ -48,7 +49,7 @@ class Bus:
             runner.advance(self.now)
             for frame in runner.take_frames():
                 made += self.boom.feed(self._captured(frame, is_transmitted=True))
-                answers = [node.answer(frame)]
+                answers = [one.answer(frame) for one in (node, second) if one is not None]
                 requests += frame.arbitration_id == 0x620
                 if requests == plc_after:
                     answers.append(node.answer(Frame(0x620, encode_upload(DEVICE_TYPE, 0))))

@@ -1,0 +1,71 @@
+"""Finds a second device with the number of a node, by the PDOs of both: a node sends its PDO once after a SYNC."""
+
+from __future__ import annotations
+
+from drivers.canopen.sync import SYNC_WINDOW_NS, Sync
+from drivers.clock import Stamp
+
+_FOUND_AFTER = 3
+_GONE_AFTER = 10
+
+
+class DuplicateNodeWatch:
+    """Follows one synchronous PDO of a node with transmission type 1 (CiA 301: sent once after each SYNC).
+
+    A SYNC is doubled if a second PDO with different data arrives soon after the first. Frames that are lost or late do
+    not look like this: after a lost SYNC the next PDO comes a whole period later, and a late PDO leaves a SYNC without
+    one. A frame that is only repeated has the same data.
+
+    Args:
+        is_duplicate: an earlier watch has found a second device, and has not found it gone.
+
+    Attributes:
+        is_duplicate: three SYNCs more were doubled than had no PDO, and there have not been ten in a row with a single
+            PDO since.
+    """
+
+    def __init__(self, is_duplicate: bool = False) -> None:
+        self.is_duplicate = is_duplicate
+        self._sync: Sync | None = None  # that of the last PDO
+        self._first: tuple[Stamp, bytes] | None = None  # the first PDO after it
+        self._is_single = False
+        self._is_doubled = False
+        self._doubled = 0
+        self._single_in_a_row = 0
+
+    def feed(self, stamp: Stamp, sync: Sync | None, data: bytes) -> None:
+        """Process a PDO.
+
+        Args:
+            stamp: when the PDO was received.
+            sync: the last SYNC before it; None if there was none.
+            data: its data.
+        """
+        if sync is None or stamp.is_doubtful or sync.stamp.is_doubtful:
+            return
+        if not 0 <= stamp.since(sync.stamp) <= SYNC_WINDOW_NS:
+            return
+        if self._sync is None or self._first is None or sync.number != self._sync.number:
+            self._next(sync)
+            self._first = stamp, data
+            return
+        self._is_single = False
+        first, first_data = self._first
+        # A quarter: up to three lost SYNCs in a row are not taken for one
+        is_soon = sync.interval_ns is not None and stamp.since(first) * 4 < sync.interval_ns
+        if is_soon and data != first_data and not self._is_doubled:
+            self._is_doubled = True
+            self._doubled += 1
+            self.is_duplicate |= self._doubled >= _FOUND_AFTER
+
+    def _next(self, sync: Sync) -> None:
+        """Count the SYNC of the last PDO, and those without any since."""
+        if self._sync is not None:
+            self._single_in_a_row = self._single_in_a_row + 1 if self._is_single else 0
+            self._doubled = max(self._doubled - (sync.number - self._sync.number - 1), 0)
+            if self._single_in_a_row >= _GONE_AFTER:
+                self._doubled = 0
+                self.is_duplicate = False
+        self._sync = sync
+        self._is_single = True
+        self._is_doubled = False

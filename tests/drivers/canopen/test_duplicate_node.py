@@ -1,0 +1,170 @@
+"""Two devices with one node number are noticed, by what a set-up reads and by their values, and neither is used."""
+
+from __future__ import annotations
+
+import pytest
+
+from drivers.can_decoder import CanDecoder
+from drivers.canopen.cia404 import AnalogueChannel, AnalogueDecoder
+from drivers.canopen.cia406 import EncoderChannel, EncoderDecoder
+from drivers.canopen.pdo import TransmitPdo
+from drivers.readings import DeviceEvent, EventKind, Reading, Record, Status
+from tests.drivers.can_support import at, capture, events, late, running, unused_channel, virtual_link
+from tests.drivers.canopen.test_node_setup import Node, canopen_node, setup
+from tests.drivers.canopen.test_setup_watch import SERIAL, Bus
+
+BOTH = "1A0 00 40 00 00", "1A0 40 40 00 00"  # 90 and 90.35 deg: less than a joint moves in the margin of a jump
+ONE = BOTH[:1]
+SYNC_PERIOD_S = 0.01
+
+
+def decoder(*, is_synchronous: bool = True) -> CanDecoder:
+    encoder = EncoderChannel(
+        name="theta1",
+        node=32,
+        pdo=TransmitPdo.usual(32, 1, (0x60040020,)),
+        max_rate_per_s=20.0,
+        is_synchronous=is_synchronous,
+    )
+    pump = AnalogueChannel(name="pump", unit="bar", node=32, pdo=TransmitPdo.usual(32, 2, (0x71300110,)))
+    return CanDecoder("boom", [EncoderDecoder(encoder), AnalogueDecoder(pump)])
+
+
+class Syncs:
+    """SYNCs on a bus, and what arrives after each."""
+
+    def __init__(self, boom: CanDecoder) -> None:
+        self.boom = boom
+        self.number = 0
+
+    def send(self, *frames: str, is_lost: bool = False, apart_s: float = 0.0004) -> list[Record]:
+        """Return the records of the frames that arrive after a SYNC."""
+        second = self.number * SYNC_PERIOD_S
+        self.number += 1
+        if not is_lost:
+            self.boom.feed(capture("080", second, is_transmitted=True))
+        made: list[Record] = []
+        for place, frame in enumerate(frames):
+            made += self.boom.feed(capture(frame, second + 0.0005 + place * apart_s))
+        return made
+
+    def count(self, count: int, *frames: str) -> list[Record]:
+        return [record for _ in range(count) for record in self.send(*frames)]
+
+
+def kinds(records: list[Record]) -> list[EventKind]:
+    return [event.kind for event in events(records)]
+
+
+def statuses(records: list[Record]) -> set[Status]:
+    return {record.status for record in records if isinstance(record, Reading)}
+
+
+def test_two_devices_that_answer_the_same_syncs_have_no_values_until_one_is_gone() -> None:
+    syncs = Syncs(decoder())
+    assert statuses(syncs.count(20, *ONE)) == {Status.OK}
+    made = syncs.count(4, *BOTH)
+    (event,) = events(made)
+    assert (event.device, event.kind) == ("theta1", EventKind.DUPLICATE_NODE)
+    assert event.text.startswith("node 32: different values arrive after the same SYNC")
+    assert statuses(syncs.count(50, *BOTH)) == {Status.DEVICE_ALARM}
+    assert statuses(list(syncs.boom.feed(capture("2A0 01 00", 0.8)))) == {Status.DEVICE_ALARM}, "of the same node"
+    made = syncs.count(11, *ONE)
+    assert kinds(made) == [EventKind.DUPLICATE_NODE_GONE]
+    assert statuses(syncs.count(20, *ONE)) == {Status.OK}, "and no jump"
+
+
+def test_a_second_device_that_answers_every_third_sync_is_found() -> None:
+    syncs = Syncs(decoder())
+    made = [record for _ in range(4) for record in (*syncs.send(*BOTH), *syncs.count(2, *ONE))]
+    assert kinds(made) == [EventKind.DUPLICATE_NODE]
+
+
+def test_two_devices_at_the_same_position_are_not_told_apart_and_not_taken_for_gone() -> None:
+    syncs = Syncs(decoder())
+    assert kinds(syncs.count(50, *ONE, *ONE)) == []
+    assert kinds(syncs.count(10, *BOTH)) == [EventKind.DUPLICATE_NODE]
+    assert kinds(syncs.count(50, *ONE, *ONE)) == []
+
+
+def test_lost_syncs_are_no_second_device() -> None:
+    syncs = Syncs(decoder())
+    moving = [f"1A0 {number:02X} 40 00 00" for number in range(200)]
+    made: list[Record] = []
+    for number, frame in enumerate(moving):
+        made += syncs.send(frame, is_lost=(number % 40 > 4 and number % 2 == 0) or number % 40 in (36, 37, 38))
+    assert kinds(made) == []
+
+
+def test_a_value_that_comes_after_the_next_sync_is_no_second_device() -> None:
+    syncs = Syncs(decoder())
+    made: list[Record] = []
+    for number in range(0, 200, 2):
+        made += syncs.send()
+        made += syncs.send(f"1A0 {number:02X} 40 00 00", f"1A0 {number + 1:02X} 40 00 00")
+    assert kinds(made) == []
+
+
+def test_values_of_doubtful_time_or_without_a_sync_show_no_second_device() -> None:
+    boom = decoder()
+    made: list[Record] = []
+    for number in range(20):
+        made += [record for frame in BOTH for record in boom.feed(capture(frame, number * 0.01))]
+    for number in range(20, 40):
+        boom.feed(capture("080", number * 0.01))
+        made += [record for frame in BOTH for record in boom.feed(late(frame, number * 0.01))]
+    assert kinds(made) == []
+
+
+def test_a_node_that_sends_by_a_timer_may_send_as_often_as_it_likes() -> None:
+    assert kinds(Syncs(decoder(is_synchronous=False)).count(50, *BOTH)) == []
+
+
+def test_a_second_device_is_known_over_a_restart_until_it_is_gone() -> None:
+    told = events(Syncs(decoder()).count(10, *BOTH))
+    after = decoder()
+    assert [event.kind for event in after.recall(told)] == [EventKind.DUPLICATE_NODE]
+    syncs = Syncs(after)
+    made = syncs.count(5, *ONE)
+    assert (kinds(made), statuses(made)) == ([], {Status.DEVICE_ALARM})
+    assert kinds(syncs.count(6, *ONE)) == [EventKind.DUPLICATE_NODE_GONE]
+    assert decoder(is_synchronous=False).recall(told) == [], "nothing would show that it is gone"
+    other = [DeviceEvent("theta1", at(0), EventKind.DUPLICATE_NODE, told[0].text.replace("32", "33"))]
+    assert decoder().recall(other) == []
+
+
+@pytest.mark.parametrize(
+    ("second", "answers"),
+    [
+        (Node({SERIAL: (0x2222, 4)}), "1018h.4: different answers, 1234h and 2222h"),
+        (Node({(0x1018, 3): (7, 4)}), "1018h.3: different answers, no such object and 7h"),
+        (Node({(0x1000, 0): (0x00020194, 4)}), "1000h.0: different answers, 20196h and 20194h"),
+    ],
+)
+def test_a_set_up_that_two_devices_answer_finds_both_and_their_values_are_not_used(second: Node, answers: str) -> None:
+    bus, node = Bus(), Node()
+    (event,) = bus.set_up(node, second=second)
+    assert event.kind is EventKind.ALARM
+    assert answers in event.text
+    assert "two devices have this node number" in event.text
+    assert "nmt 01" not in node.log, "not started"
+    assert bus.status() is Status.DEVICE_ALARM
+    assert [event.kind for event in bus.set_up(Node())] == [EventKind.CONFIGURED]
+    assert bus.status() is Status.OK
+
+
+def test_a_link_finds_two_nodes_of_one_number_on_its_bus() -> None:
+    channel = unused_channel()
+    link = virtual_link(channel, allow_transmit=True, transmit_nodes=(32,), setups=[setup()])
+    with canopen_node(channel), canopen_node(channel) as second, running(link) as heard:
+        second.sdo[0x1018][4].raw = 0x2222
+        heard.wait_for(EventKind.LINK_UP)
+        link.request_setup()
+        event = heard.wait_for(EventKind.ALARM)
+        assert "two devices have this node number" in event.text
+        assert second.nmt.state != "OPERATIONAL"
+
+
+def test_two_devices_whose_identity_is_the_same_are_set_up_together() -> None:
+    bus = Bus()
+    assert [event.kind for event in bus.set_up(Node(), second=Node())] == [EventKind.CONFIGURED]
