@@ -337,7 +337,7 @@ class _Session:
             self._setup.advance(self._clock.now())
         # Even if no set-up is active any more, the last node's start command and event may be left to send
         if not all(self._send(frame) for frame in self._setup.take_frames()):
-            self._setup.abort(self._clock.now(), "the transmit queue was full")
+            self._setup.abort(self._clock.now(), "the transmit queue was full or the adapter refused")
         self._emit_setup_events()
         if monotonic_ns >= self._check_losses_ns:
             self._check_losses_ns = monotonic_ns + LOSS_CHECK_NS

@@ -104,6 +104,9 @@ def slcan_line(frame: Frame) -> bytes:
 class SlcanLines:
     """Splits an adapter's bytes into lines and parses these into frames. Pure.
 
+    An adapter's timestamps are either on or off. A line with a timestamp among lines without, or the reverse, has lost
+    or gained characters that may be data, so it is malformed; several in a row show that the setting was changed.
+
     Attributes:
         malformed: number of lines that were neither a frame nor an answer to a command.
         refused: number of commands that the adapter has refused since the last one that it has carried out.
@@ -117,9 +120,12 @@ class SlcanLines:
     _STATE = re.compile(rb"s([awpb])(\d{3})(\d{3})")
     _ERRORS = re.compile(rb"e(\d)([abBcfsoO]+)")
     _LINE_MAX = 64  # bytes; more without a line end is noise
+    _CHANGED_AFTER = 3
 
     def __init__(self) -> None:
         self._rest = b""
+        self._has_times: bool | None = None  # as the adapter's timestamps are set; None before the first frame
+        self._otherwise = 0  # lines in a row that look as if they were set otherwise
         self.malformed = self.refused = 0
 
     def feed(self, data: bytes) -> list[Frame]:
@@ -156,7 +162,16 @@ class SlcanLines:
         end = 0 if is_remote else 2 * int(length)
         if len(digits) not in (end, end + 4):  # four more digits if the adapter's timestamps are on
             return None
+        if not self._is_as_set(has_time=len(digits) != end):
+            return None
         return Frame(identifier, bytes.fromhex(digits[:end].decode("ascii")), is_extended, is_remote)
+
+    def _is_as_set(self, *, has_time: bool) -> bool:
+        """Return True if the adapter's other lines have, or lack, a timestamp like this one."""
+        self._otherwise = 0 if has_time == self._has_times else self._otherwise + 1
+        if self._has_times is None or self._otherwise == self._CHANGED_AFTER:
+            self._has_times, self._otherwise = has_time, 0
+        return has_time == self._has_times
 
     def _error_frame(self, line: bytes) -> Frame | None:
         """Return the error frame equivalent to an adapter's error line; None if the line is not one."""

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+from collections import deque
+
 from drivers.canopen.sync import SYNC_WINDOW_NS, Sync
 from drivers.clock import Stamp
 
 _FOUND_AFTER = 3
 _GONE_AFTER = 10
+_INTERVALS = 9  # of which five may be too long, because SYNCs were lost, and three too short, as they were read late
 
 
 class DuplicateNodeWatch:
     """Follows one synchronous PDO of a node with transmission type 1 (CiA 301: sent once after each SYNC).
 
-    A SYNC is doubled if a second PDO with different data arrives soon after the first. Frames that are lost or late do
-    not look like this: after a lost SYNC the next PDO comes a whole period later, and a late PDO leaves a SYNC without
-    one. A frame that is only repeated has the same data.
+    A SYNC is doubled if a second PDO with different data arrives within two fifths of a SYNC period after the first.
+    Frames that are lost or late do not look like this: after a lost SYNC the next PDO comes a whole period later, and a
+    late PDO leaves a SYNC without one. A frame that is only repeated has the same data.
 
     Args:
         is_duplicate: an earlier watch has found a second device, and has not found it gone.
@@ -28,6 +31,7 @@ class DuplicateNodeWatch:
         self.is_duplicate = is_duplicate
         self._sync: Sync | None = None  # that of the last PDO
         self._first: tuple[Stamp, bytes] | None = None  # the first PDO after it
+        self._intervals_ns: deque[int] = deque(maxlen=_INTERVALS)  # of the last SYNCs with a PDO
         self._is_single = False
         self._is_doubled = False
         self._doubled = 0
@@ -51,12 +55,14 @@ class DuplicateNodeWatch:
             return
         self._is_single = False
         first, first_data = self._first
-        # A quarter: up to three lost SYNCs in a row are not taken for one
-        is_soon = sync.interval_ns is not None and stamp.since(first) * 4 < sync.interval_ns
-        if is_soon and data != first_data and not self._is_doubled:
+        if data != first_data and not self._is_doubled and stamp.since(first) * 5 < self._period_ns() * 2:
             self._is_doubled = True
             self._doubled += 1
             self.is_duplicate |= self._doubled >= _FOUND_AFTER
+
+    def _period_ns(self) -> int:
+        """Return the period of SYNC by its last intervals; 0 before the first one."""
+        return sorted(self._intervals_ns)[len(self._intervals_ns) // 3] if self._intervals_ns else 0
 
     def _next(self, sync: Sync) -> None:
         """Count the SYNC of the last PDO, and those without any since."""
@@ -66,6 +72,8 @@ class DuplicateNodeWatch:
             if self._single_in_a_row >= _GONE_AFTER:
                 self._doubled = 0
                 self.is_duplicate = False
+        if sync.interval_ns is not None:
+            self._intervals_ns.append(sync.interval_ns)
         self._sync = sync
         self._is_single = True
         self._is_doubled = False

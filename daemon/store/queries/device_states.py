@@ -27,7 +27,7 @@ NAMED = """WITH RECURSIVE named(device) AS (
         SELECT min(device) FROM device_events
         UNION ALL SELECT (SELECT min(device) FROM device_events WHERE device > named.device)
             FROM named WHERE named.device IS NOT NULL)"""
-_DEVICES = f"{NAMED} SELECT device FROM named WHERE device IS NOT NULL"
+DEVICES = f"{NAMED} SELECT device FROM named WHERE device IS NOT NULL"
 _LAST = """SELECT id, utc_ns, monotonic_ns, boot_id, device, kind, text, code FROM device_events
     WHERE device = ? AND kind = ? AND boot_id = ? AND monotonic_ns < ? AND {}
     ORDER BY monotonic_ns DESC, id DESC LIMIT 1"""
@@ -53,7 +53,7 @@ def device_states(source: Connection | Reader, before: Stamp) -> list[DeviceEven
     boots = list(source.rows("SELECT id FROM boots WHERE kernel_boot_id = ?", [before.boot_id]))
     boot = boots[0]["id"] if boots else _NEXT_BOOT
     found: dict[int, dict[str, Any]] = {}
-    for device in [row["device"] for row in source.rows(_DEVICES)]:
+    for device in [row["device"] for row in source.rows(DEVICES)]:
         for kind in STATES:
             about = (device, kind.value, boot, before.monotonic_ns)
             sent = "code IS NOT NULL" if kind in (EventKind.ALARM, EventKind.WARNING) else "TRUE"

@@ -1,7 +1,8 @@
 """Deletion of the oldest captures, readings and fixes that no session needs.
 
-Data in a session, from a minute before it and from shortly after it are kept, and so are observations, events, gaps,
-jobs and models. Freed pages are used again; the file does not shrink.
+Data in a session, from a minute before it and from shortly after it are kept, and so are observations, gaps, jobs and
+models. Of what a device has reported again and again, the last report of each kind is kept; other events are all kept.
+Freed pages are used again; the file does not shrink.
 """
 
 from __future__ import annotations
@@ -10,11 +11,14 @@ import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+from daemon.store.queries.device_states import DEVICES
 from daemon.store.queries.sessions import AFTER_NS, BEFORE_NS
 from daemon.store.rows import RowSource
 from daemon.store.store import Store
 from daemon.store.write_ahead_log import KEPT_BYTES, log_bytes
+from drivers.canopen.supervision import VOIDS
 from drivers.clock import NS_PER_S, Clock
+from drivers.readings import EventKind
 
 Place = tuple[int, int]  # row of a boot, and ns of its monotonic clock; places sort in order of time
 
@@ -54,6 +58,28 @@ _FIXES = """DELETE FROM fixes WHERE id IN (SELECT id FROM fixes
 _STATIONS = """WITH RECURSIVE known(name) AS (SELECT min(station) FROM fixes
         UNION ALL SELECT (SELECT min(station) FROM fixes WHERE station > name) FROM known WHERE name IS NOT NULL)
     SELECT name FROM known WHERE name IS NOT NULL"""
+# All but the last of a device and kind, and of emergencies the last that voids values (see device_states). Alarms and
+# warnings without a code are not the device's own.
+_EVENTS = f"""DELETE FROM device_events WHERE id IN (SELECT id FROM device_events AS event
+    WHERE device = ?6 AND kind = ?7 AND (boot_id, monotonic_ns) >= (?1, ?2) AND (boot_id, monotonic_ns) <= (?3, ?4)
+        AND (kind NOT IN ('{EventKind.ALARM}', '{EventKind.WARNING}') OR code IS NOT NULL)
+        AND EXISTS (SELECT 1 FROM device_events AS later WHERE device = ?6 AND kind = ?7 AND boot_id = event.boot_id
+            AND (monotonic_ns, id) > (event.monotonic_ns, event.id) AND (boot_id, monotonic_ns) <= (?3, ?4)
+            AND (later.code IS NOT NULL) >= (event.code IS NOT NULL)
+            AND (later.text LIKE '%{VOIDS}') >= (event.text LIKE '%{VOIDS}'))
+    LIMIT ?5)"""
+REPEATED = (
+    EventKind.ALARM,
+    EventKind.BOOT_UP,
+    EventKind.EMERGENCY,
+    EventKind.EMERGENCY_CLEARED,
+    EventKind.HEARTBEAT_LOST,
+    EventKind.HEARTBEAT_RESTORED,
+    EventKind.NMT_STATE,
+    EventKind.WARNING,
+)
+"""Events that a faulty device may cause with each of its frames."""
+
 SAMPLES = ("joint_samples", "signals", "decode_failures")
 
 
@@ -201,6 +227,9 @@ class Retention:
             self._delete_rows(_ROWS.format(table), [*begin, *end, STEP_ROWS])
         for station in [row["name"] for row in self._store.rows(_STATIONS)]:
             self._delete_rows(_FIXES, [*begin, *end, STEP_ROWS, station])
+        for device in [row["device"] for row in self._store.rows(DEVICES)]:
+            for kind in REPEATED:
+                self._delete_rows(_EVENTS, [*begin, *end, STEP_ROWS, device, kind.value])
         with self._store.transaction() as db:
             ids = [(number,) for number in chunk_ids]
             db.conn.executemany("DELETE FROM small_chunks WHERE chunk_id = ?", ids)

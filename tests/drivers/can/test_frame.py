@@ -143,6 +143,34 @@ def test_two_lines_whose_end_was_lost_between_them_are_counted_and_give_no_frame
     assert lines.malformed == 1
 
 
+@pytest.mark.parametrize(
+    ("before", "line"),
+    [
+        (b"t1A02AABB0001", b"t1A02AABB"),
+        (b"t1A04AABBCCDD0001", b"t1A04CCDD0002"),
+        (b"t1A02AABB", b"t1A02AABB0001"),
+        (b"t1A02AABB", b"r1A02AABB"),
+    ],
+)
+def test_a_line_that_lost_or_gained_the_digits_of_a_timestamp_is_counted_and_gives_no_frame(
+    before: bytes, line: bytes
+) -> None:
+    lines = SlcanLines()
+    assert len(lines.feed(before + b"\r")) == 1
+    assert lines.feed(2 * (line + b"\r")) == []
+    assert lines.malformed == 2
+    assert len(lines.feed(before + b"\r")) == 1
+    assert lines.feed(2 * (line + b"\r")) == [], "counted anew, as the lines were not in a row"
+
+
+def test_timestamps_that_an_adapter_begins_to_send_are_taken_for_such_after_three_lines() -> None:
+    lines = SlcanLines()
+    assert len(lines.feed(b"t1A02AABB\r")) == 1
+    assert lines.feed(5 * b"t1A02AABB0001\r") == 3 * [Frame(0x1A0, b"\xaa\xbb")]
+    assert lines.malformed == 2
+    assert lines.feed(b"t1A02AABB\r") == []
+
+
 @pytest.mark.parametrize("line", [b"z", b"Z", b"F00", b"F8a", b"V1013", b"NA123"])
 def test_answers_of_an_adapter_are_no_lost_lines(line: bytes) -> None:
     lines = SlcanLines()

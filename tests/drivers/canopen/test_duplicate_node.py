@@ -80,6 +80,14 @@ def test_a_second_device_that_answers_every_third_sync_is_found() -> None:
     assert kinds(made) == [EventKind.DUPLICATE_NODE]
 
 
+def test_a_second_device_that_takes_longer_to_answer_is_found() -> None:
+    syncs = Syncs(decoder())
+    syncs.count(5, *ONE)
+    assert kinds([record for _ in range(10) for record in syncs.send(*BOTH, apart_s=0.0035)]) == [
+        EventKind.DUPLICATE_NODE
+    ]
+
+
 def test_two_devices_at_the_same_position_are_not_told_apart_and_not_taken_for_gone() -> None:
     syncs = Syncs(decoder())
     assert kinds(syncs.count(50, *ONE, *ONE)) == []

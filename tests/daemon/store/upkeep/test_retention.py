@@ -12,11 +12,13 @@ from pathlib import Path
 import pytest
 
 from daemon.store import Reader, Store
+from daemon.store.queries.device_states import device_states
 from daemon.store.upkeep import retention
 from daemon.store.upkeep.housekeeping import Housekeeping, Keeping
 from daemon.store.upkeep.retention import Retention, Room, cutoff_ns, room
+from drivers.canopen.supervision import VOIDS
 from drivers.clock import NS_PER_S, ManualClock, Stamp
-from drivers.readings import Capture, Fix, Reading
+from drivers.readings import Capture, DeviceEvent, EventKind, Fix, Reading
 from tests.daemon.support.damage import small_disk
 from tests.daemon.support.store import at, fix, frame, reading, table
 
@@ -104,6 +106,37 @@ def test_what_was_captured_in_an_open_session_stays_in_every_boot(path: Path, st
     delete_all(store)
     assert minutes_left(path) == [*range(19, 30)]
     assert minutes_left(path, "boot-b") == [*range(300)]
+
+
+def test_what_a_device_reports_again_and_again_goes_and_its_last_state_stays_known(path: Path, store: Store) -> None:
+    fill(store, 200)
+    session(store, "s1", at(50 * MINUTE_S), at(60 * MINUTE_S))
+    reported = [
+        (EventKind.EMERGENCY, f"node 32: device hardware; {VOIDS}", 0x5000),
+        (EventKind.EMERGENCY_CLEARED, "node 32: all errors have cleared", 0),
+        (EventKind.ALARM, "node 32: position error", 1),
+        (EventKind.ALARM, "theta1 (node 32): cannot be set up", None),
+        (EventKind.PRESET_JUMP, "a jump", None),
+    ]
+    times = [minute * MINUTE_S + second for minute in range(200) for second in (0.5, 1.0, 1.5)]
+    store.insert_records([DeviceEvent("theta1", at(t), *event) for t in times[:300] for event in reported])
+    other = [DeviceEvent("theta1", at(t), EventKind.EMERGENCY, "node 32: temperature", 0x4000) for t in times[300:]]
+    store.insert_records(
+        [*other, *(DeviceEvent("theta2", at(t), EventKind.BOOT_UP, "node 33 has booted") for t in times)]
+    )
+    before = at(300 * MINUTE_S)
+    with Reader(path) as reader:
+        states = device_states(reader, before)
+    delete_all(store)
+    with Reader(path) as reader:
+        assert device_states(reader, before) == states
+        assert device_states(reader, at(55 * MINUTE_S)), "what a session needs"
+    left = [(row["device"], row["kind"], row["code"]) for row in table(path, "device_events")]
+    in_session = 3 * 16  # a minute before, and a few after
+    assert left.count(("theta1", "alarm", None)) == left.count(("theta1", "preset_jump", None)) == 300
+    assert 3 * 11 < left.count(("theta1", "emergency", 0x5000)) < in_session
+    assert 3 * 11 < left.count(("theta1", "alarm", 1)) < in_session
+    assert 3 * 60 < left.count(("theta2", "boot_up", None)) < 3 * 62 + in_session
 
 
 def test_only_what_is_older_goes_by_age(path: Path, store: Store) -> None:
