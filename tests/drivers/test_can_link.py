@@ -329,10 +329,10 @@ def test_a_channel_that_an_slcan_adapter_has_closed_is_opened_again_after_a_sile
     monkeypatch.setattr(slcan_port, "SILENT_S", 0.2)
     with running(slcan_link(adapter, allow_transmit=may_send)) as heard:
         heard.wait_for(EventKind.LINK_UP)
-        adapter.waiting()
-        assert adapter.commands(command) == command
+        adapter.commands(command)
+        assert command in adapter.commands(command), "opened again"
         adapter.send(b"\r")
-        assert adapter.commands(command) == command, "and again, as it may have been refused unheard"
+        assert command in adapter.commands(command), "and again, as it may have been refused unheard"
         adapter.send(b"\at1A01AA\r")
         heard.wait(lambda: heard.received, "a frame")
     assert not heard.events(EventKind.FRAMES_DROPPED)
