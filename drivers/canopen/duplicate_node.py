@@ -7,8 +7,9 @@ from collections import deque
 from drivers.canopen.sync import SYNC_WINDOW_NS, Sync
 from drivers.clock import Stamp
 
-_FOUND_AFTER = 3
-_GONE_AFTER = 10
+_FOUND_AFTER = 5
+_GONE_AFTER = 10  # SYNCs with a single PDO
+_AGREE_AFTER = 100  # SYNCs without different data: each frame arrives twice, or the devices agree
 _INTERVALS = 9  # of which five may be too long, because SYNCs were lost, and three too short, as they were read late
 
 
@@ -23,8 +24,8 @@ class DuplicateNodeWatch:
         is_duplicate: an earlier watch has found a second device, and has not found it gone.
 
     Attributes:
-        is_duplicate: three SYNCs more were doubled than had no PDO, and there have not been ten in a row with a single
-            PDO since.
+        is_duplicate: five SYNCs more were doubled than had no PDO, and there have not been ten in a row with a single
+            PDO since, nor a hundred in a row without different data.
     """
 
     def __init__(self, is_duplicate: bool = False) -> None:
@@ -32,10 +33,8 @@ class DuplicateNodeWatch:
         self._sync: Sync | None = None  # that of the last PDO
         self._first: tuple[Stamp, bytes] | None = None  # the first PDO after it
         self._intervals_ns: deque[int] = deque(maxlen=_INTERVALS)  # of the last SYNCs with a PDO
-        self._is_single = False
-        self._is_doubled = False
-        self._doubled = 0
-        self._single_in_a_row = 0
+        self._is_single = self._is_doubled = self._differs = False  # PDOs after it: one; two soon; two with other data
+        self._doubled = self._single_in_a_row = self._alike_in_a_row = 0
 
     def feed(self, stamp: Stamp, sync: Sync | None, data: bytes) -> None:
         """Process a PDO.
@@ -55,10 +54,15 @@ class DuplicateNodeWatch:
             return
         self._is_single = False
         first, first_data = self._first
+        self._differs |= data != first_data
         if data != first_data and not self._is_doubled and stamp.since(first) * 5 < self._period_ns() * 2:
             self._is_doubled = True
             self._doubled += 1
             self.is_duplicate |= self._doubled >= _FOUND_AFTER
+
+    def is_silent(self, sync: Sync | None) -> bool:
+        """Return True if the PDO has not arrived after any of the last SYNCs; False if it has never arrived."""
+        return sync is not None and self._sync is not None and sync.number - self._sync.number > _AGREE_AFTER
 
     def _period_ns(self) -> int:
         """Return the period of SYNC by its last intervals; 0 before the first one."""
@@ -69,11 +73,11 @@ class DuplicateNodeWatch:
         if self._sync is not None:
             self._single_in_a_row = self._single_in_a_row + 1 if self._is_single else 0
             self._doubled = max(self._doubled - (sync.number - self._sync.number - 1), 0)
-            if self._single_in_a_row >= _GONE_AFTER:
+            self._alike_in_a_row = 0 if self._differs else self._alike_in_a_row + 1
+            if self._single_in_a_row >= _GONE_AFTER or self._alike_in_a_row >= _AGREE_AFTER:
                 self._doubled = 0
                 self.is_duplicate = False
         if sync.interval_ns is not None:
             self._intervals_ns.append(sync.interval_ns)
         self._sync = sync
-        self._is_single = True
-        self._is_doubled = False
+        self._is_single, self._is_doubled, self._differs = True, False, False

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from drivers.canopen.sdo import Upload, UploadResponse, decode_response
+from drivers.canopen.sdo import MISSING, AbortResponse, Upload, UploadResponse, decode_response
 from drivers.errors import DeviceError
 
 
@@ -36,12 +36,16 @@ class Findings:
             answer = decode_response(data)
         except ValueError:
             return
-        if not isinstance(answer, UploadResponse) or answer.data is None:
+        value: int | None
+        if isinstance(answer, UploadResponse) and answer.data is not None:
+            value = int.from_bytes(answer.data, "little")
+        elif isinstance(answer, AbortResponse) and answer.code in MISSING:
+            value = None
+        else:
             return
-        key, value = (answer.index, answer.subindex), int.from_bytes(answer.data, "little")
+        key = answer.index, answer.subindex
         if self.identity.get(key, value) == value:
             return
-        before = self.identity[key]
-        answers = f"{'no such object' if before is None else f'{before:X}h'} and {value:X}h"
-        text = f"{Upload(*key)}: different answers, {answers}; two devices have this node number, change one"
+        before, after = ("no such object" if found is None else f"{found:X}h" for found in (self.identity[key], value))
+        text = f"{Upload(*key)}: different answers, {before} and {after}; two devices have this node number, change one"
         raise MismatchError(where, text)

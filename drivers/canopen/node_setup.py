@@ -24,8 +24,7 @@ from drivers.canopen.pdo import (
     TransmitPdo,
 )
 from drivers.canopen.sdo import (
-    NO_SUCH_OBJECT,
-    NO_SUCH_SUBINDEX,
+    MISSING,
     Download,
     SdoAbortError,
     SdoExchange,
@@ -397,7 +396,7 @@ def _optional(index: int, subindex: int) -> Generator[_Step, bytes, int | None]:
     try:
         return _unsigned((yield Upload(index, subindex)))
     except SdoAbortError as error:
-        if error.code in (NO_SUCH_OBJECT, NO_SUCH_SUBINDEX):
+        if error.code in MISSING:
             return None
         raise
 

@@ -15,6 +15,7 @@ UPLOAD_MAX_BYTES = 4096  # far more than any object read here has; limits memory
 
 NO_SUCH_OBJECT = 0x06020000
 NO_SUCH_SUBINDEX = 0x06090011
+MISSING = NO_SUCH_OBJECT, NO_SUCH_SUBINDEX
 
 ABORT_TEXTS = {
     0x05030000: "toggle bit not alternated",

@@ -145,7 +145,7 @@ class NodeSupervision:
         if watch is None:
             watch = self._duplicates[pdo] = DuplicateNodeWatch(self._is_duplicate)
         watch.feed(stamp, sync, data)
-        is_duplicate = any(watch.is_duplicate for watch in self._duplicates.values())
+        is_duplicate = any(watch.is_duplicate and not watch.is_silent(sync) for watch in self._duplicates.values())
         if is_duplicate == self._is_duplicate:
             return []
         self._is_duplicate = is_duplicate

@@ -17,7 +17,7 @@ AT_ONCE_S = 0.5  # devices last received within this time of each other fell sil
 _WHY = {
     Status.NOT_AVAILABLE: "the device reports that it has no value",
     Status.OUT_OF_RANGE: "the value is outside the device's measuring range",
-    Status.DEVICE_ALARM: "an alarm of the device makes its value invalid, or its set-up found a wrong device",
+    Status.DEVICE_ALARM: "an alarm of the device, a wrong device or a second one of its node number voids its value",
     Status.MALFORMED: "the value cannot be decoded",
     Status.TIME_DOUBTFUL: "this computer reads too late to know when the value was measured; check what keeps it busy",
 }
@@ -80,7 +80,8 @@ def joint_not_usable(evidence: Evidence) -> Iterator[Finding]:
 
     The device has no value, reports an alarm or is out of its range; or its value cannot be decoded, or was read too
     late for its time to be known. Raised after 1.5 s, so that one bad sample raises no alarm; cleared after 3 s of good
-    samples. Not raised where the device's own alarm, an emergency or a failed set-up explains the invalid values.
+    samples. Not raised where the device's own alarm, an emergency, a failed set-up or a second device with its node
+    number explains the invalid values.
     """
     yield from _not_usable(evidence, "joint")
 
@@ -146,6 +147,7 @@ def _not_usable(evidence: Evidence, kind: str) -> Iterator[Finding]:
     told |= {
         e.device for e in evidence.active_events(EventKind.EMERGENCY, EventKind.EMERGENCY_CLEARED, EventKind.BOOT_UP)
     }
+    told |= {e.device for e in evidence.active_events(EventKind.DUPLICATE_NODE, EventKind.DUPLICATE_NODE_GONE)}
     for channel in evidence.acquisition.channels:
         if channel.status == Status.DEVICE_ALARM and channel.name in told:
             continue

@@ -149,14 +149,14 @@ def model_not_loaded(evidence: Evidence) -> Iterator[Finding]:
     "If a session was open at the jump, stop it: no fix since the jump is used. Check the joint's zero. Where it is as "
     "before, run `rigcal model zeros-checked`; otherwise, and before the first model, start a new session and "
     "calibrate again.",
-    hold_s=10.0,
+    hold_s=3.0,
 )
 def zero_lost(evidence: Evidence) -> Iterator[Finding]:
     """The encoder of a joint has jumped or was exchanged, and nobody has checked its zero.
 
     This happened since the live model was trained, since the newest session was started, or in the open session.
     Aborted and rejected sessions do not count. The model then gives no tip, no job uses sessions from before the jump,
-    and the open session takes no more fixes. Cleared 10 s after none of these conditions holds.
+    and the open session takes no more fixes. Cleared 3 s after none of these conditions holds.
     """
     unchecked = dict.fromkeys((*(() if evidence.model is None else evidence.model.jumped), *evidence.zeros_lost))
     session = () if evidence.session is None else evidence.session.jumped

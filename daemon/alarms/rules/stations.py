@@ -81,7 +81,8 @@ def instrument_error(evidence: Evidence) -> Iterator[Finding]:
 
 @rule(
     "critical",
-    "Aim the station at the session's prism. If the alarm stays although the station is on that prism, check that no "
+    "Aim the station at the session's prism. If the station or its tripod was moved, stop the session and describe a "
+    "new set-up. If the alarm stays although the station stands where it was and is on that prism, check that no "
     "joint's zero has changed, and run `rigcal session confirm-prism`.",
 )
 def prism_jump(evidence: Evidence) -> Iterator[Finding]:

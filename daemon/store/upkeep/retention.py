@@ -71,6 +71,8 @@ _EVENTS = f"""DELETE FROM device_events WHERE id IN (SELECT id FROM device_event
 REPEATED = (
     EventKind.ALARM,
     EventKind.BOOT_UP,
+    EventKind.DUPLICATE_NODE,
+    EventKind.DUPLICATE_NODE_GONE,
     EventKind.EMERGENCY,
     EventKind.EMERGENCY_CLEARED,
     EventKind.HEARTBEAT_LOST,

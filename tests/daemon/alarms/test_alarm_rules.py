@@ -282,6 +282,11 @@ CASES: dict[str, list[tuple[Evidence, list[str], Evidence]]] = {
             ["theta1"],
             known(event(E.ALARM, "theta1", code=1), channels=[channel("device_alarm")]),
         ),
+        (
+            known(event(E.DUPLICATE_NODE_GONE, "theta1"), channels=[channel("device_alarm")]),
+            ["theta1"],
+            known(event(E.DUPLICATE_NODE, "theta1"), channels=[channel("device_alarm")]),
+        ),
     ],
     "signal_not_usable": [
         (known(channels=[channel("not_available", "boom_valve", "signal")]), ["boom_valve"], known()),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from random import Random
+
 import pytest
 
 from drivers.can_decoder import CanDecoder
@@ -18,16 +20,19 @@ ONE = BOTH[:1]
 SYNC_PERIOD_S = 0.01
 
 
-def decoder(*, is_synchronous: bool = True) -> CanDecoder:
-    encoder = EncoderChannel(
-        name="theta1",
+def encoder(name: str = "theta1", pdo: int = 1, *, is_synchronous: bool = True) -> EncoderChannel:
+    return EncoderChannel(
+        name=name,
         node=32,
-        pdo=TransmitPdo.usual(32, 1, (0x60040020,)),
+        pdo=TransmitPdo.usual(32, pdo, (0x60040020,)),
         max_rate_per_s=20.0,
         is_synchronous=is_synchronous,
     )
+
+
+def decoder(*, is_synchronous: bool = True) -> CanDecoder:
     pump = AnalogueChannel(name="pump", unit="bar", node=32, pdo=TransmitPdo.usual(32, 2, (0x71300110,)))
-    return CanDecoder("boom", [EncoderDecoder(encoder), AnalogueDecoder(pump)])
+    return CanDecoder("boom", [EncoderDecoder(encoder(is_synchronous=is_synchronous)), AnalogueDecoder(pump)])
 
 
 class Syncs:
@@ -63,7 +68,7 @@ def statuses(records: list[Record]) -> set[Status]:
 def test_two_devices_that_answer_the_same_syncs_have_no_values_until_one_is_gone() -> None:
     syncs = Syncs(decoder())
     assert statuses(syncs.count(20, *ONE)) == {Status.OK}
-    made = syncs.count(4, *BOTH)
+    made = syncs.count(6, *BOTH)
     (event,) = events(made)
     assert (event.device, event.kind) == ("theta1", EventKind.DUPLICATE_NODE)
     assert event.text.startswith("node 32: different values arrive after the same SYNC")
@@ -76,7 +81,7 @@ def test_two_devices_that_answer_the_same_syncs_have_no_values_until_one_is_gone
 
 def test_a_second_device_that_answers_every_third_sync_is_found() -> None:
     syncs = Syncs(decoder())
-    made = [record for _ in range(4) for record in (*syncs.send(*BOTH), *syncs.count(2, *ONE))]
+    made = [record for _ in range(6) for record in (*syncs.send(*BOTH), *syncs.count(2, *ONE))]
     assert kinds(made) == [EventKind.DUPLICATE_NODE]
 
 
@@ -88,11 +93,36 @@ def test_a_second_device_that_takes_longer_to_answer_is_found() -> None:
     ]
 
 
-def test_two_devices_at_the_same_position_are_not_told_apart_and_not_taken_for_gone() -> None:
+def test_two_devices_at_the_same_position_are_not_told_apart_and_taken_for_gone_after_a_hundred_syncs() -> None:
     syncs = Syncs(decoder())
     assert kinds(syncs.count(50, *ONE, *ONE)) == []
     assert kinds(syncs.count(10, *BOTH)) == [EventKind.DUPLICATE_NODE]
-    assert kinds(syncs.count(50, *ONE, *ONE)) == []
+    assert kinds(syncs.count(99, *ONE, *ONE)) == []
+    assert kinds(syncs.count(5, *ONE, *ONE)) == [EventKind.DUPLICATE_NODE_GONE]
+
+
+def test_a_pdo_that_is_no_longer_sent_keeps_no_values_of_its_node_invalid() -> None:
+    boom = CanDecoder(
+        "boom", [EncoderDecoder(encoder(name, number)) for number, name in ((1, "theta1"), (2, "theta2"))]
+    )
+    syncs = Syncs(boom)
+    assert kinds(syncs.count(10, *BOTH, "2A0 00 40 00 00", "2A0 40 40 00 00")) == [EventKind.DUPLICATE_NODE]
+    made = syncs.count(200, *ONE)
+    assert kinds(made) == [EventKind.DUPLICATE_NODE_GONE]
+    assert statuses(made[-1:]) == {Status.OK}
+
+
+def test_frames_that_are_lost_at_random_and_read_in_batches_are_no_second_device() -> None:
+    random = Random(5)
+    boom, made, number = decoder(), list[Record](), 0
+    for batch in range(6000):
+        read_s = batch * 0.016
+        while number * SYNC_PERIOD_S < read_s:
+            for frame in ("080", f"1A0 {number % 256:02X} 40 00 00"):
+                if random.random() > 0.05:
+                    made += boom.feed(capture(frame, read_s))
+            number += 1
+    assert kinds(made) == []
 
 
 def test_lost_syncs_are_no_second_device() -> None:
@@ -146,6 +176,7 @@ def test_a_second_device_is_known_over_a_restart_until_it_is_gone() -> None:
     [
         (Node({SERIAL: (0x2222, 4)}), "1018h.4: different answers, 1234h and 2222h"),
         (Node({(0x1018, 3): (7, 4)}), "1018h.3: different answers, no such object and 7h"),
+        (Node({SERIAL: None}), "1018h.4: different answers, 1234h and no such object"),
         (Node({(0x1000, 0): (0x00020194, 4)}), "1000h.0: different answers, 20196h and 20194h"),
     ],
 )
