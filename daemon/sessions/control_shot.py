@@ -25,7 +25,7 @@ class Shot:
     """One shot of a control point.
 
     Attributes:
-        wanted: number of fixes needed.
+        wanted: number of fixes needed; 0 for a time during which a guide knows that the station is on no prism.
         since, until: fixes measured in between are not of the prism.
         aimed: fixes measured from this instant on may be of the point; None until the station was told to turn to it.
         fixes, places_mm: fixes so far, and their places in the station's frame.

@@ -64,6 +64,11 @@ class OpenSession:
             away.append((self.cut_off, self.back()))
         return self.lasted(stamp) and not any(lies_within(self.order, stamp, *time) for time in away)
 
+    @property
+    def is_away(self) -> bool:
+        """True while a guide knows that the station is on no prism."""
+        return any(not shot.wanted and shot.until is None for shot in self.shots)
+
     def back(self) -> Stamp | None:
         """Return when the station was back after a shot that was cut off: on a confirmation, or after another shot."""
         ends = [one.at for one in self.confirmations]

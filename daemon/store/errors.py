@@ -99,7 +99,10 @@ def storage_sentence(path: Path, error: sqlite3.Error | OSError) -> str:
             "allowed to write to it"
         )
     if name.startswith(("SQLITE_CORRUPT", "SQLITE_NOTADB")):
-        return f"{path}: cannot be used as a store ({reason}): move it away and restore the store from a backup"
+        return (
+            f"{path}: cannot be used as a store ({reason}): move it away and restore the store from a backup, or use "
+            "another backup if this is one"
+        )
     if name.startswith(("SQLITE_BUSY", "SQLITE_LOCKED")):
         return f"{path}: locked by another program ({reason}): end that program (a `sqlite3` shell, a backup)"
     return f"{path}: cannot be used ({reason}; {free}): check the disk; `dmesg` may show the fault"

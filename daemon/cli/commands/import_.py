@@ -97,10 +97,11 @@ def import_(
     saved = None
     if map_path is None:
         saved = out.with_name(f"{out.stem}.map.toml")
-        write_file(saved, map_text(columns, file.name).encode())
+        _write_map(saved, map_text(columns, file.name))
+    replaced = offline.replaced(out)
     write_file(out, table.encode())
     if not as_json:
-        echo(f"{known.title}: {len(fixes)} points written to {out}")
+        echo(f"{known.title}: {len(fixes)} points written to {out}{replaced}")
         for note in notes:
             echo(f"  {note}")
         if saved is not None:
@@ -116,3 +117,14 @@ def import_(
         "notes": list(notes),
         "has_joints": rows is not None,
     }
+
+
+def _write_map(path: Path, text: str) -> None:
+    """Write a map, unless a different one is there, which may have been edited."""
+    from daemon.host.safe_output import write_file
+
+    if path.exists() and path.read_bytes() != text.encode():
+        raise click.UsageError(
+            f"{path} describes other columns, perhaps edited by hand: give it with --map to use it, or move it away"
+        )
+    write_file(path, text.encode())

@@ -270,6 +270,21 @@ def test_a_saved_map_makes_an_import_repeatable(tmp_path: Path) -> None:
     assert again.read_bytes() == out.read_bytes()
 
 
+def test_a_map_that_was_edited_is_not_written_over(tmp_path: Path) -> None:
+    survey, out = tmp_path / "survey.csv", tmp_path / "out.csv"
+    survey.write_text(SURVEY)
+    run(survey, "--out", out)
+    assert "points written to " + f"{out} (replaced)" in run(survey, "--out", out).stdout, "the map is the same"
+    saved, before = tmp_path / "out.map.toml", out.read_bytes()
+    edited = saved.read_text() + '\n[prisms]\ntmac = "r"\n'
+    saved.write_text(edited)
+    survey.write_text(SURVEY.replace("100,5", "100,6"))
+    refused = run(survey, "--out", out)
+    assert refused.exit_code == 2
+    assert "describes other columns, perhaps edited by hand: give it with --map" in refused.stderr
+    assert (saved.read_text(), out.read_bytes()) == (edited, before)
+
+
 def test_a_gts_download_becomes_observations(tmp_path: Path) -> None:
     download, out = tmp_path / "memory.gts", tmp_path / "out.csv"
     download.write_text(gts_download(), encoding="latin-1")

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import shutil
+import sqlite3
 from pathlib import Path
 from typing import Any
 
@@ -55,6 +57,13 @@ def test_a_store_is_told_checked_backed_up_damaged_and_restored(config: Path) ->
     restored = told(config, "restore", backup)
     assert (Path(restored["replaced"]) / "rigcal.sqlite").stat().st_size == 8192
     assert told(config, "check")["captures"] == 10
+    with contextlib.closing(sqlite3.connect(Path(backup) / "rigcal.sqlite")) as db:
+        db.execute("UPDATE raw_chunks SET chunk = substr(chunk, 1, 40) || x'00' || substr(chunk, 42)")
+        db.commit()
+    damaged = say(config, "check", "--backup", backup)
+    assert damaged.exit_code == 1
+    assert "do not restore this backup; make another one of the store: `rigcal store backup`" in damaged.output
+    assert "restore the store from a backup" not in damaged.output
 
 
 def test_a_store_that_is_a_link_is_not_restored_in_the_place_of_the_link(config: Path, tmp_path: Path) -> None:

@@ -103,6 +103,18 @@ def test_a_prism_that_an_operator_confirms_counts_from_then_on(rig: Rig) -> None
     assert events(rig, EventKind.PRISM_CONFIRMED) == [answer["text"]]
 
 
+def test_a_guide_that_sends_the_station_to_a_control_point_hears_nothing_of_a_wrong_prism(rig: Rig) -> None:
+    start(rig)
+    rig.live(2)
+    rig.target_mm = ANOTHER_MM
+    rig.live(5)
+    assert rig.keeper.prism_suspicions()
+    rig.keeper.look_away()
+    assert rig.keeper.prism_suspicions() == []
+    assert rig.keeper.open_session()["prism_suspicions"] == []  # type: ignore[index]
+    assert [s for s in rig.say("stop")["advice"] if "perhaps another prism" in s], "but its fixes are not used"
+
+
 def test_a_prism_is_confirmed_in_a_session_alone(rig: Rig) -> None:
     with pytest.raises(CommandError, match="no session is open"):
         rig.say("confirm_prism")
