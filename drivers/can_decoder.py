@@ -35,8 +35,7 @@ class CanDecoder:
     Args:
         link: name of the link.
         channels: decoders of its channels. The nodes of CANopen channels are supervised (see NodeSupervision).
-        setups: set-ups of those nodes that rigcal may set up; of several for one node the last one counts, as for
-            `CanLink`.
+        setups: set-ups of its nodes; of several for one node the last one counts, as for `CanLink`.
     """
 
     def __init__(self, link: str, channels: Iterable[ChannelDecoder], setups: Iterable[NodeSetup] = ()) -> None:
@@ -95,9 +94,9 @@ class CanDecoder:
         if capture.is_error:
             return self._bus_errors.feed(stamp, capture.arbitration_id, capture.data)
         key = capture.arbitration_id
-        if key == SYNC_ID and not capture.is_extended:
+        if key == SYNC_ID and not (capture.is_extended or capture.is_remote):
             # Including rigcal's own SYNC: it marks an instant and is not a reading
-            self._sync = Sync(stamp) if self._sync is None else self._sync.next(stamp)
+            self._sync = Sync(stamp, 0 if self._sync is None else self._sync.number + 1)
         if capture.is_extended:
             key |= _EXTENDED
         if capture.is_transmitted:

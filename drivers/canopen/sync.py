@@ -19,16 +19,10 @@ class Sync:
     Attributes:
         stamp: when it was sent or received.
         number: number of SYNCs before it.
-        interval_ns: time since the one before it; None for the first one.
     """
 
     stamp: Stamp
     number: int = 0
-    interval_ns: int | None = None
-
-    def next(self, stamp: Stamp) -> Sync:
-        """Return the SYNC that follows this one at `stamp`."""
-        return Sync(stamp, self.number + 1, stamp.since(self.stamp))
 
 
 class SyncProducer:

@@ -153,6 +153,8 @@ def test_a_synchronous_pdo_carries_the_instant_of_its_sync() -> None:
     assert the_reading(feed(boom, "1A0 00 40 00 00", 0.102)).stamp == at(0.100)
     assert the_reading(feed(boom, "1A1 00 40 00 00", 0.104)).stamp == at(0.100)
     assert the_reading(feed(boom, "1A0 00 40 00 00", 0.110)).stamp == at(0.110), "one SYNC is one sample"
+    feed(boom, "080", 0.120, is_remote=True)
+    assert the_reading(feed(boom, "1A0 00 40 00 00", 0.121)).stamp == at(0.121), "a request is no SYNC"
     feed(boom, "080", 0.200)
     assert the_reading(feed(boom, "1A0 00 40 00 00", 0.190)).stamp == at(0.190), "received before the SYNC was sent"
 

@@ -61,16 +61,16 @@ def heartbeat_lost(evidence: Evidence) -> Iterator[Finding]:
 @rule(
     "critical",
     "Give one of the two devices a different node number. If there is only one, it sends more often than at SYNC: run "
-    "`rigcal devices configure`, or let whoever sets it up change its transmission type to 1. If SYNC is no longer "
-    "sent, send it again, or change the channel's `mode` in the rig file.",
+    "`rigcal devices configure` where the link may transmit, or let whoever sets it up change its transmission type to "
+    "1. If SYNC is no longer sent, send it again, or change the channel's `mode` in the rig file.",
     hold_s=3.0,
 )
 def duplicate_node(evidence: Evidence) -> Iterator[Finding]:
     """Two devices on a CAN bus send values under the same CANopen node number.
 
-    Different values arrive after the same SYNC, and neither is used. The alarm survives a restart of the daemon.
-    Cleared 3 s after a single value has arrived after each of ten SYNCs, or equal values after each of a hundred.
-    Without SYNC nothing shows whether one of the devices is gone.
+    More different values arrive than SYNCs, and none of them is used. The alarm survives a restart of the daemon.
+    Cleared 3 s after at most one value has arrived for each SYNC of 20 or more, over half a second or more. Without
+    SYNC nothing shows whether one of the devices is gone.
     """
     for event in evidence.active_events(EventKind.DUPLICATE_NODE, EventKind.DUPLICATE_NODE_GONE):
         if not evidence.is_cut_off(event.device):

@@ -216,7 +216,7 @@ def test_the_newest_serial_number_is_told_until_a_set_up_succeeds(store: Store) 
     assert device_states(store, at(50)) == [again]
 
 
-def test_on_a_link_that_may_not_transmit_neither_reads_nor_earlier_set_ups_void_values(
+def test_on_a_link_that_may_not_transmit_any_more_reads_void_no_values_and_earlier_set_ups_do(
     store: Store, acquire: Make
 ) -> None:
     rig = load_rig("swdt82")
@@ -224,10 +224,12 @@ def test_on_a_link_that_may_not_transmit_neither_reads_nor_earlier_set_ups_void_
     may_send = CONFIG.replace("[[station]]", "allow_transmit = true\ntransmit_nodes = [32]\n[[station]]")
     sending = decoders(parse_config(may_send, Path.cwd()), rig)
     declare_channels(store, rig.rig)
-    acquire([], listening).run_inline([REFUSED, capture("5A0 43 00 10 00 92 01 02 00", 4), capture(PDO, 5)])
+    acquire([], listening).run_inline([capture("5A0 43 00 10 00 92 01 02 00", 1), capture(PDO, 2)])
     assert statuses(store) == ["ok"]
-    acquire([], sending).run_inline([capture(PDO, 50)])
-    assert statuses(store) == ["ok", "device_alarm"]
+    store.insert_records([replace(REFUSED, stamp=at(4))])
+    for n, links in enumerate((sending, listening, sending)):
+        acquire([], links).run_inline([capture(PDO, 10 + n)])
+    assert statuses(store) == ["ok", *3 * ["device_alarm"]]
 
 
 @pytest.mark.parametrize("booted", [False, True])
