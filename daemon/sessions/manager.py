@@ -346,7 +346,7 @@ class SessionManager:
             self._store.once_committed(partial(session.end_shots, self._clock.now()))
 
     def prism_suspicions(self) -> list[Suspicion]:
-        """Return stations that may be on a wrong prism, unless a guide has turned them away; for calls by any thread."""
+        """Return stations that may be on a wrong prism, unless a guide has turned them away; callable by any thread."""
         session = self._open
         if session is None or session.is_away:
             return []
