@@ -58,7 +58,7 @@ def test_a_store_is_told_checked_backed_up_damaged_and_restored(config: Path) ->
     assert (Path(restored["replaced"]) / "rigcal.sqlite").stat().st_size == 8192
     assert told(config, "check")["captures"] == 10
     with contextlib.closing(sqlite3.connect(Path(backup) / "rigcal.sqlite")) as db:
-        db.execute("UPDATE raw_chunks SET chunk = substr(chunk, 1, 40) || x'00' || substr(chunk, 42)")
+        db.execute("UPDATE raw_chunks SET chunk = CAST(substr(chunk, 1, 40) || x'00' || substr(chunk, 42) AS BLOB)")
         db.commit()
     damaged = say(config, "check", "--backup", backup)
     assert damaged.exit_code == 1

@@ -214,9 +214,10 @@ def test_a_set_up_that_two_devices_answer_finds_both_and_their_values_are_not_us
 
 def test_a_link_finds_two_nodes_of_one_number_on_its_bus() -> None:
     channel = unused_channel()
-    link = virtual_link(channel, allow_transmit=True, transmit_nodes=(32,), setups=[setup()])
+    wanted = setup(units_per_revolution=8192, total_units=1 << 25)  # nothing else ends it before both have answered
+    link = virtual_link(channel, allow_transmit=True, transmit_nodes=(32,), setups=[wanted])
     with canopen_node(channel), canopen_node(channel) as second, running(link) as heard:
-        second.sdo[0x1018][4].raw = 0x2222
+        second.sdo[0x1000].raw = 0x00030196
         heard.wait_for(EventKind.LINK_UP)
         link.request_setup()
         event = heard.wait_for(EventKind.ALARM)
