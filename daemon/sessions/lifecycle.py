@@ -251,7 +251,8 @@ class SessionLifecycle:
             The reason why it was not used.
 
         Raises:
-            CommandError: the session is not closed, is used already, or was recorded with a different rig file.
+            CommandError: the session is not closed, is used already, was recorded with a different rig file, or is
+                not used because it has no usable pose.
             NotInStoreError: there is no such session.
         """
         with self._store.transaction():
@@ -263,6 +264,8 @@ class SessionLifecycle:
                 raise CommandError(f"session {session_id!r} is already used by calibration; there is nothing to accept")
             if despite.startswith(OTHER_RIG_FILE):
                 raise CommandError(f"session {session_id!r}: {despite}; {HOW_TO_READ_AGAIN}", REFUSED)
+            if despite == NO_POSE:
+                raise CommandError(f"session {session_id!r}: {NO_POSE}; hold another session", REFUSED)
             self._decide(session_id, operator, "accepted", instead_of="rejected")
             self._models.forget_drift(session_id)
             told = {"accepted_despite": despite, "accepted_after_job": self._jobs.newest_id()}

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 from daemon.alarms.alarm import Finding, rule
 from daemon.alarms.evidence import Evidence
+from daemon.commands import NO_POSE
 
 WITHOUT_FIX_S = 600.0
 LONG_S = 86_400.0
@@ -62,7 +63,7 @@ def gain_meter_hangs(evidence: Evidence) -> Iterator[Finding]:
 @rule(
     "warning",
     "Hold a new session with control shots at its start and end, or accept this one with "
-    "`rigcal session accept SUBJECT`.",
+    "`rigcal session accept SUBJECT`. `rigcal session reject SUBJECT` ends the alarm, too.",
 )
 def session_not_trained(evidence: Evidence) -> Iterator[Finding]:
     """Calibration does not use a closed session: control shots are missing at its start or end, or the station moved.
@@ -70,7 +71,11 @@ def session_not_trained(evidence: Evidence) -> Iterator[Finding]:
     Cleared when an operator accepts or rejects the session, or when a newer session is used.
     """
     for name, why in evidence.untrained_sessions.items():
-        yield name, f"calibration does not use the session: {why}"
+        text = f"calibration does not use the session: {why}"
+        if NO_POSE in why:
+            yield name, text, None, "Hold a new session. `rigcal session reject SUBJECT` ends the alarm, too."
+        else:
+            yield name, text
 
 
 @rule(

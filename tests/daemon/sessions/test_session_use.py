@@ -8,7 +8,7 @@ import pytest
 from click.testing import CliRunner
 
 from daemon.cli.main import main
-from daemon.commands import CommandError
+from daemon.commands import NO_POSE, CommandError
 from daemon.config.config import Config
 from daemon.control.server import ControlServer
 from daemon.jobs.job_queue import JobQueue
@@ -221,6 +221,15 @@ def test_an_accepted_session_is_trained_on_and_who_said_so_is_kept(session_rig: 
     assert told["accepted"]["despite"].startswith("no control point was shot")
     assert told["accepted"]["utc_ns"] == session_rig.clock.now().utc_ns
     assert [order.session_ids for order in Jobs(session_rig).run() if order.kind == "gap"] == [(name,)]
+
+
+def test_a_session_without_a_usable_pose_is_not_accepted(session_rig: Rig) -> None:
+    name = str(session_rig.say("start", prism="r")["id"])
+    session_rig.shoot("cp1", CP1)
+    assert session_rig.say("stop")["not_used"] == NO_POSE
+    with pytest.raises(CommandError, match=f"session '{name}': {NO_POSE}; hold another session"):
+        session_rig.say("accept", id=name)
+    assert session_rig.say("show", id=name)["accepted"] is None
 
 
 def test_a_session_that_is_accepted_after_a_later_one_was_trained_on_is_trained_on_with_it(session_rig: Rig) -> None:
