@@ -315,9 +315,9 @@ def decoders(config: Config, source: RigSource, files: ChannelFiles | None = Non
     made: dict[str, Callable[[], Decoder]] = {}
     for section in config.can:
         factories = decoder_factories(source.rig, files, section.name)
-        # Also of nodes that rigcal may not set up: what an earlier set-up has found wrong stays wrong
         setups = node_setups(source.rig, files, section.name)
-        made[section.name] = partial(_can_decoder, section.name, factories, setups)
+        permitted = [setup for setup in setups if setup.node in section.transmit_nodes]
+        made[section.name] = partial(_can_decoder, section.name, factories, permitted)
         _check_identifiers(section.name, config.own_identifiers(section.name), factories)
     for station in config.station:
         made[station.name] = partial(StationDecoder, station)

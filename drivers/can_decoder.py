@@ -35,7 +35,8 @@ class CanDecoder:
     Args:
         link: name of the link.
         channels: decoders of its channels. The nodes of CANopen channels are supervised (see NodeSupervision).
-        setups: set-ups of its nodes; of several for one node the last one counts, as for `CanLink`.
+        setups: set-ups of those nodes that rigcal may set up; of several for one node the last one counts, as for
+            `CanLink`.
     """
 
     def __init__(self, link: str, channels: Iterable[ChannelDecoder], setups: Iterable[NodeSetup] = ()) -> None:

@@ -21,7 +21,7 @@ from daemon.guide.record import GuideStep
 from daemon.guide.request import misfit
 from daemon.host.worker_thread import WorkerThread
 from daemon.sessions.manager import SessionManager
-from daemon.sessions.station_setups import StationSetups
+from daemon.sessions.station_setups import CONTROL_POINT_RADIUS_MM, StationSetups
 from drivers.clock import NS_PER_S, Clock
 
 log = logging.getLogger(__name__)
@@ -221,7 +221,7 @@ class GuideWorker(WorkerThread):
 
     def _shoot(self, point: str, at: GuideStep) -> None:
         with acting_for(None, partial(self._is_over, at)):
-            shot = self._sessions.shoot_command({"point": point})
+            shot = self._sessions.shoot_command({"point": point}, most_off_mm=CONTROL_POINT_RADIUS_MM)
         with self._course.record.turn:
             guide = self._course.record.opened()
             self._course.happen("shot", {"point": point, "misclosure_mm": shot["misclosure_mm"]}, only_at=at)

@@ -241,10 +241,10 @@ class SessionManager:
             log.warning("session %s is not used: %s", session_id, why)
             return self._table.summary(session_id)
 
-    def shoot_command(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
+    def shoot_command(self, arguments: Mapping[str, Any], *, most_off_mm: float = math.inf) -> dict[str, Any]:
         """Measure a control point: the mean of the next good fixes. The first shot of a point defines its place.
 
-        A target that is far from the point's known place is not the point, and the shot is refused.
+        A target further than `most_off_mm` from the known place is not the point, and the shot is refused.
         """
         with self.turn:
             session = self._needs_open()
@@ -255,7 +255,7 @@ class SessionManager:
                 self._shot = shot
                 try:
                     shot.wait(self._clock, self._settings.shot_timeout_s, self._why_no_fix)
-                    result = self._keep_shot(session, name, shot)
+                    result = self._keep_shot(session, name, shot, most_off_mm)
                 finally:
                     self._shot = None
             return result | {"advice": after_a_move(session.id) if result["moved"] else []}
@@ -316,8 +316,6 @@ class SessionManager:
                 log.warning("the station could not be aimed at prism %s again: %s", session.prism, error)
             finally:
                 self.turn.leave()
-
-    # ---- for a guide -------------------------------------------------------------------------------------------------
 
     def look_away(self) -> None:
         """Exclude fixes of the open session from now on, because the station is not on its prism."""
@@ -398,11 +396,13 @@ class SessionManager:
     def _has_begun(self, session: OpenSession) -> None:
         self._open = session
 
-    def _keep_shot(self, session: OpenSession, name: str, shot: Shot) -> dict[str, Any]:
+    def _keep_shot(self, session: OpenSession, name: str, shot: Shot, most_off_mm: float) -> dict[str, Any]:
         """Store a shot before it ends, and judge earlier fixes near its point again if this shot has located it."""
         with self._store.transaction():
             phase = self._table.phase(session.id, name)
-            result = self._setups.store_shot(session.setup_id, session.id, name, phase, shot.fixes, shot.places_mm)
+            result = self._setups.store_shot(
+                session.setup_id, session.id, name, phase, shot.fixes, shot.places_mm, most_off_mm=most_off_mm
+            )
             points = self._setups.control_points(session.setup_id, session.id)
             for place in session.control_points:
                 if place not in points:  # an earlier shot of this point was not of the point

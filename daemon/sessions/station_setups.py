@@ -144,10 +144,10 @@ class StationSetups:
         phase: str,
         fixes: Sequence[Fix],
         places_mm: Sequence[Place],
+        *,
+        most_off_mm: float = math.inf,
     ) -> dict[str, Any]:
         """Store a shot of a control point, and mark the set-up as moved if the point is not where it was.
-
-        A target further than `CONTROL_POINT_RADIUS_MM` from the point's known place is not the point.
 
         Args:
             setup_id: set-up of the station.
@@ -156,6 +156,7 @@ class StationSetups:
             phase: `start` or `end` of the session.
             fixes: fixes that are averaged.
             places_mm: their places in the station's frame.
+            most_off_mm: a target further from the point's known place is not the point.
 
         Returns:
             point, phase, x_mm, y_mm, z_mm, misclosure_mm (None if this shot defined the point), moved.
@@ -175,12 +176,11 @@ class StationSetups:
                         f"at {name} and measure again",
                         REFUSED,
                     )
-        if distance_mm >= CONTROL_POINT_RADIUS_MM:
+        if distance_mm > most_off_mm:
             raise CommandError(
                 f"the station's target is {distance_mm / 1e3:.1f} m from control point {name}, and nothing was stored: "
-                f"aim at {name} and measure again. If the station was moved, end what is open and describe the new "
-                f"set-up. If the first shot of {name} was of another target, go on without it (in a guide: `--skip`); "
-                "the session is then used only if you accept it",
+                f"aim at {name} and measure again; if the station itself was moved, stop the guide and start a new one "
+                "with a new set-up",
                 REFUSED,
             )
         misclosure_mm = distance_mm if known else None

@@ -8,7 +8,7 @@ from dataclasses import replace
 from drivers.canopen.cia301 import NmtState, decode_heartbeat, emcy_id, heartbeat_id, sdo_response_id
 from drivers.canopen.duplicate_node import DuplicateNodeWatch
 from drivers.canopen.emcy import decode_emergency
-from drivers.canopen.node_setup import NodeSetup
+from drivers.canopen.node_setup import NOT_USED, NodeSetup
 from drivers.canopen.pdo_channel import PdoChannelDecoder
 from drivers.canopen.sdo import UploadResponse, decode_response
 from drivers.canopen.setup_watch import SetupWatch
@@ -50,7 +50,8 @@ class NodeSupervision:
     Args:
         node: node number.
         channels: decoders of the channels that the node feeds, at least one; events use the first one's name.
-        setup: expected identity and settings of the node; None if it is never set up.
+        setup: expected identity and settings of the node; None if rigcal may not set it up. What earlier set-ups have
+            found wrong stays wrong all the same.
     """
 
     def __init__(self, node: int, channels: Sequence[PdoChannelDecoder], setup: NodeSetup | None = None) -> None:
@@ -59,6 +60,7 @@ class NodeSupervision:
         self._name = channels[0].name
         self._setups = None if setup is None else SetupWatch(setup)
         self._has_failed = False  # by an emergency
+        self._was_wrong = False  # an earlier set-up found a wrong device, and rigcal may not set the node up any more
         self._is_synchronous = any(channel.is_synchronous for channel in channels)
         self._is_duplicate = False
         self._duplicates: dict[int, DuplicateNodeWatch] = {}  # by the key of a PDO's identifier
@@ -92,13 +94,12 @@ class NodeSupervision:
             is_jump or event.kind is EventKind.CONFIGURED or (event.kind is EventKind.ALARM and event.code is None)
         )
         about = (f"node {self.node}:", f"node {self.node} ")
-        if is_of_setup and self._setups is not None:
-            if not event.text.startswith((*about, f"{event.device} (node {self.node}):")):
-                return []
-            self._setups.recall(event)
-            self._mark()
-            return [] if is_jump else [replace(event, device=self._setups.name)]
-        if is_of_setup or not event.text.startswith(about):
+        if is_of_setup:
+            is_own = event.text.startswith((*about, f"{event.device} (node {self.node}):"))
+            is_told = is_own and self._recall_setup(event)
+            name = self._name if self._setups is None else self._setups.name
+            return [replace(event, device=name)] if is_told and not is_jump else []
+        if not event.text.startswith(about):
             return []
         if event.kind in (EventKind.ALARM, EventKind.WARNING):
             return [replace(event, device=channel.name) for channel in self._channels if channel.recall(event)]
@@ -116,6 +117,16 @@ class NodeSupervision:
             return []
         self._mark()
         return [replace(event, device=self._name)]
+
+    def _recall_setup(self, event: DeviceEvent) -> bool:
+        """Restore what a set-up has shown, and return whether it still matters."""
+        is_wrong = event.text.endswith(NOT_USED)
+        if self._setups is not None:
+            self._setups.recall(event)
+        elif event.kind is not EventKind.PRESET_JUMP:
+            self._was_wrong = is_wrong or (self._was_wrong and event.kind is EventKind.ALARM)
+        self._mark()
+        return self._setups is not None or is_wrong
 
     def requested(self, stamp: Stamp, data: bytes) -> None:
         """Process an SDO request that rigcal has sent to the node."""
@@ -210,7 +221,7 @@ class NodeSupervision:
 
     def _mark(self) -> None:
         """Tell the channels whether the node's values are valid."""
-        is_wrong = self._setups is not None and self._setups.is_mismatched
+        is_wrong = self._was_wrong if self._setups is None else self._setups.is_mismatched
         is_void = self._has_failed or self._is_duplicate or is_wrong
         for channel in self._channels:
             channel.is_void = is_void

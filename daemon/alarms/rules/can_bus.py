@@ -89,7 +89,11 @@ def emergency(evidence: Evidence) -> Iterator[Finding]:
             yield event.device, event.text
 
 
-@rule("critical", "Check the device. If its set-up has failed, run `rigcal devices configure` to set it up again.")
+@rule(
+    "critical",
+    "Check the device. If its set-up has failed, run `rigcal devices configure` to set it up "
+    "again, which the link must permit (`allow_transmit`, `transmit_nodes`).",
+)
 def device_alarm(evidence: Evidence) -> Iterator[Finding]:
     """A device reports an alarm (object 6503h), or its set-up has failed.
 

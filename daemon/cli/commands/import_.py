@@ -48,7 +48,6 @@ def import_(
     from daemon.cli.imported_points import (
         bare_times,
         far_repetitions,
-        map_text,
         observations_csv,
         prisms_of,
         read_export,
@@ -97,7 +96,7 @@ def import_(
     saved = None
     if map_path is None:
         saved = out.with_name(f"{out.stem}.map.toml")
-        _write_map(saved, map_text(columns, file.name))
+        _keep_map(saved, columns, file.name)
     replaced = offline.replaced(out)
     write_file(out, table.encode())
     if not as_json:
@@ -119,12 +118,12 @@ def import_(
     }
 
 
-def _write_map(path: Path, text: str) -> None:
-    """Write a map, unless a different one is there, which may have been edited."""
+def _keep_map(path: Path, columns: Any, name: str) -> None:
+    """Write a map of the file `name`, unless it is there already; refuse if a different one is, perhaps edited."""
+    from daemon.cli.imported_points import map_text, read_map
     from daemon.host.safe_output import write_file
 
-    if path.exists() and path.read_bytes() != text.encode():
-        raise click.UsageError(
-            f"{path} describes other columns, perhaps edited by hand: give it with --map to use it, or move it away"
-        )
-    write_file(path, text.encode())
+    if not path.is_file():
+        write_file(path, map_text(columns, name).encode())
+    elif read_map(path) != columns:
+        raise click.UsageError(f"{path} describes other columns, perhaps edited: give it with --map, or move it away")

@@ -230,6 +230,12 @@ def test_on_a_link_that_may_not_transmit_any_more_reads_void_no_values_and_earli
     for n, links in enumerate((sending, listening, sending)):
         acquire([], links).run_inline([capture(PDO, 10 + n)])
     assert statuses(store) == ["ok", *3 * ["device_alarm"]]
+    unanswered = [
+        replace(UNANSWERED, stamp=at(20)),
+        replace(CONFIGURED, stamp=at(21)),
+        replace(UNANSWERED, stamp=at(22)),
+    ]
+    assert listening["boom"]().recall(unanswered) == [], "nothing that a set-up could not read voids a value"  # type: ignore[attr-defined]
 
 
 @pytest.mark.parametrize("booted", [False, True])

@@ -275,13 +275,18 @@ def test_a_map_that_was_edited_is_not_written_over(tmp_path: Path) -> None:
     survey.write_text(SURVEY)
     run(survey, "--out", out)
     assert "points written to " + f"{out} (replaced)" in run(survey, "--out", out).stdout, "the map is the same"
+    other = tmp_path / "other.csv"
+    other.write_text(SURVEY)
+    assert run(other, "--out", out).exit_code == 0, "another file of the same columns"
     saved, before = tmp_path / "out.map.toml", out.read_bytes()
     edited = saved.read_text() + '\n[prisms]\ntmac = "r"\n'
     saved.write_text(edited)
-    survey.write_text(SURVEY.replace("100,5", "100,6"))
+    other.write_text(SURVEY.replace("100,5", "100,6"))
+    refused = run(other, "--out", out)
+    assert (refused.exit_code, saved.read_text()) == (2, edited)
     refused = run(survey, "--out", out)
     assert refused.exit_code == 2
-    assert "describes other columns, perhaps edited by hand: give it with --map" in refused.stderr
+    assert "describes other columns, perhaps edited: give it with --map" in refused.stderr
     assert (saved.read_text(), out.read_bytes()) == (edited, before)
 
 
