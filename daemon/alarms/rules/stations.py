@@ -89,7 +89,8 @@ def prism_jump(evidence: Evidence) -> Iterator[Finding]:
     """While a session is open, a station's target has jumped further than a boom can move.
 
     The station may follow a different prism, and its fixes are not used. Cleared when the target is the earlier one
-    again, when an operator confirms the prism, or when the session ends; never by the passing of time.
+    again, when an operator confirms the prism, or when the session ends, and while a guide has turned the station to a
+    control point; never by the passing of time.
     """
     for suspicion in evidence.suspicions:
         yield suspicion.station, f"{suspicion.reason}; its fixes are not used"
