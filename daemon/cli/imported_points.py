@@ -12,12 +12,14 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
+import click
 from pydantic import ValidationError
 
 from calibration.rig.columns import LABELS, POSITION, names
 from calibration.rig.description import Rig
 from calibration.rig.toml import parse_toml, quoted
 from calibration.rig.toml_errors import place, reason
+from daemon.host.safe_output import write_file
 from drivers.errors import DescriptionError
 from drivers.files import read_whole
 from drivers.stations.export_format import ColumnMap, ExportedFix, refuse
@@ -82,6 +84,24 @@ def map_text(columns: ColumnMap, source: str) -> str:
         if told.get(section):
             lines += ["", f"[{section}]", *(f"{quoted(key)} = {_toml(value)}" for key, value in told[section].items())]
     return "\n".join(lines) + "\n"
+
+
+def keep_map(path: Path, columns: ColumnMap, source: str) -> None:
+    """Write a map, unless it is there already.
+
+    Args:
+        path: where it is kept.
+        columns: the map.
+        source: name of the file that it was made for.
+
+    Raises:
+        click.UsageError: a different map is there, which may have been edited.
+        DescriptionError: what is there is no map.
+    """
+    if not path.is_file():
+        write_file(path, map_text(columns, source).encode())
+    elif read_map(path) != columns:
+        raise click.UsageError(f"{path} describes other columns, perhaps edited: give it with --map, or move it away")
 
 
 def _toml(value: object) -> str:

@@ -25,7 +25,7 @@ from itertools import groupby, pairwise
 
 import numpy as np
 
-from daemon.store.errors import StoreError
+from daemon.store.errors import DamagedChunkError, StoreError
 from daemon.store.packed_captures import CaptureColumns, Planes, packed, planes, unpacked
 from drivers.clock import Stamp
 from drivers.readings import CanCapture, Capture, SerialCapture
@@ -201,7 +201,7 @@ def require_sound(blob: bytes) -> None:
         known = f"{_VERSION} to {_VERSION_LARGE}"
         raise StoreError(f"chunk of captures has version {blob[4]}, but this rigcal reads {known}; use a newer rigcal")
     if _CRC.unpack_from(blob, len(blob) - _CRC.size)[0] != zlib.crc32(blob[: -_CRC.size]):
-        raise StoreError("chunk of captures is damaged (its CRC-32 does not match)")
+        raise DamagedChunkError("chunk of captures is damaged (its CRC-32 does not match)")
 
 
 def decode_run(blob: bytes) -> CaptureRun:
@@ -215,7 +215,7 @@ def decode_run(blob: bytes) -> CaptureRun:
         return _decode(blob)
     except (ArithmeticError, LookupError, TypeError, ValueError, lzma.LZMAError, zlib.error) as error:
         # The CRC-32 is right, so the chunk was written wrong: by a different program, or on a faulty computer.
-        raise StoreError(f"chunk of captures is invalid ({error})") from error
+        raise DamagedChunkError(f"chunk of captures is invalid ({error})") from error
 
 
 def _decode(blob: bytes) -> CaptureRun:

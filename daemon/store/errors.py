@@ -37,6 +37,18 @@ class NotInStoreError(StoreError):
     """There is no row of the requested name or number; the message names the command that lists the rows."""
 
 
+class DamagedChunkError(StoreError):
+    """A chunk of captures is damaged.
+
+    Attributes:
+        what: how, without the advice to restore the store, as the chunk may be in a backup.
+    """
+
+    def __init__(self, what: str) -> None:
+        super().__init__(f"{what}; restore the store from a backup")
+        self.what = what
+
+
 class StoreBusyError(StoreError):
     """Another process writes to this store.
 

@@ -8,6 +8,7 @@ from drivers.clock import NS_PER_S, Stamp
 _ALLOWED = 1.2  # PDOs per SYNC; more than one, as SYNCs may be lost
 _LEAST_EXCESS = 6.0
 _BATCH_NS = NS_PER_S // 5  # an adapter may hold PDOs back for as long
+_MARGIN = 1.2  # of the PDOs that an adapter may hold back
 _PAUSE = 10  # usual periods of SYNC
 _WINDOW_SYNCS = 20
 _WINDOW_NS = NS_PER_S // 2
@@ -81,7 +82,7 @@ class DuplicateNodeWatch:
         if elapsed_ns < _WINDOW_NS:
             return
         self._period_ns = elapsed_ns / syncs
-        self._enough = max(_LEAST_EXCESS, 1.2 * _BATCH_NS / self._period_ns)
+        self._enough = max(_LEAST_EXCESS, _MARGIN * _BATCH_NS / self._period_ns)
         if syncs < _WINDOW_SYNCS:
             return
         if self._counted <= _ALLOWED * syncs:

@@ -48,6 +48,7 @@ def import_(
     from daemon.cli.imported_points import (
         bare_times,
         far_repetitions,
+        keep_map,
         observations_csv,
         prisms_of,
         read_export,
@@ -96,7 +97,7 @@ def import_(
     saved = None
     if map_path is None:
         saved = out.with_name(f"{out.stem}.map.toml")
-        _keep_map(saved, columns, file.name)
+        keep_map(saved, columns, file.name)
     replaced = offline.replaced(out)
     write_file(out, table.encode())
     if not as_json:
@@ -116,14 +117,3 @@ def import_(
         "notes": list(notes),
         "has_joints": rows is not None,
     }
-
-
-def _keep_map(path: Path, columns: Any, name: str) -> None:
-    """Write a map of the file `name`, unless it is there already; refuse if a different one is, perhaps edited."""
-    from daemon.cli.imported_points import map_text, read_map
-    from daemon.host.safe_output import write_file
-
-    if not path.is_file():
-        write_file(path, map_text(columns, name).encode())
-    elif read_map(path) != columns:
-        raise click.UsageError(f"{path} describes other columns, perhaps edited: give it with --map, or move it away")

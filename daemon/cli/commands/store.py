@@ -104,12 +104,12 @@ def store_check(config: Path, backup: Path | None, *, as_json: bool) -> Delivere
         echo(f"{path}: checked {parts[0]} in {parts[1]}, {parts[2]}")
         for finding in found.findings:
             echo(f"  damaged: {finding}", fg="red")
-        damaged = (
-            "restore the store from a backup: `rigcal store restore`"
-            if backup is None
-            else "do not restore this backup; make another one of the store: `rigcal store backup`"
-        )
-        echo(damaged if found.findings else "no damage found")
+        if not found.findings:
+            echo("no damage found")
+        elif backup is None:
+            echo("restore the store from a backup: `rigcal store restore`")
+        else:
+            echo("do not restore this backup; make another one of the store: `rigcal store backup`")
     result = {
         "store": str(path),
         "is_sound": not found.findings,

@@ -11,7 +11,7 @@ import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from daemon.store.queries.device_states import DEVICES
+from daemon.store.queries.device_states import DEVICES, STATES
 from daemon.store.queries.sessions import AFTER_NS, BEFORE_NS
 from daemon.store.rows import RowSource
 from daemon.store.store import Store
@@ -68,18 +68,7 @@ _EVENTS = f"""DELETE FROM device_events WHERE id IN (SELECT id FROM device_event
             AND (later.code IS NOT NULL) >= (event.code IS NOT NULL)
             AND (later.text LIKE '%{VOIDS}') >= (event.text LIKE '%{VOIDS}'))
     LIMIT ?5)"""
-REPEATED = (
-    EventKind.ALARM,
-    EventKind.BOOT_UP,
-    EventKind.DUPLICATE_NODE,
-    EventKind.DUPLICATE_NODE_GONE,
-    EventKind.EMERGENCY,
-    EventKind.EMERGENCY_CLEARED,
-    EventKind.HEARTBEAT_LOST,
-    EventKind.HEARTBEAT_RESTORED,
-    EventKind.NMT_STATE,
-    EventKind.WARNING,
-)
+REPEATED = (*STATES, EventKind.NMT_STATE)
 """Events that a faulty device may cause with each of its frames."""
 
 SAMPLES = ("joint_samples", "signals", "decode_failures")

@@ -12,7 +12,7 @@ from pathlib import Path
 from sqlite_utils import Database
 
 from daemon.store.captures import require_sound
-from daemon.store.errors import StoreError, storage_errors
+from daemon.store.errors import DamagedChunkError, StoreError, storage_errors
 from daemon.store.migrations import unknown_migrations
 from daemon.store.reader import Reader
 from daemon.store.upkeep.model_places import place_of_model
@@ -69,7 +69,8 @@ def check_store(path: Path, models: Path | None, go_on: Callable[[], None] = lam
                 try:
                     require_sound(row["chunk"])
                 except StoreError as error:
-                    findings.append(f"raw chunk {row['id']}: {error}")
+                    what = error.what if isinstance(error, DamagedChunkError) else error
+                    findings.append(f"raw chunk {row['id']}: {what}")
             if models is not None:
                 for row in reader.rows(_MODELS):
                     looked_at += 1

@@ -235,7 +235,9 @@ def test_on_a_link_that_may_not_transmit_any_more_reads_void_no_values_and_earli
         replace(CONFIGURED, stamp=at(21)),
         replace(UNANSWERED, stamp=at(22)),
     ]
-    assert listening["boom"]().recall(unanswered) == [], "nothing that a set-up could not read voids a value"  # type: ignore[attr-defined]
+    listener = listening["boom"]()
+    assert isinstance(listener, CanDecoder)
+    assert listener.recall(unanswered) == [], "nothing that a set-up could not read voids a value"
 
 
 @pytest.mark.parametrize("booted", [False, True])

@@ -104,6 +104,12 @@ def test_a_frame_that_no_bus_can_carry_is_refused_by_name() -> None:
         encode_captures([CanCapture("boom", at(0), 2**32, b"")])
 
 
+def test_a_damaged_chunk_is_told_with_what_to_do() -> None:
+    (chunk,) = encode_captures([frame(0)])
+    with pytest.raises(StoreError, match="is damaged .*; restore the store from a backup"):
+        decode_captures(chunk.blob[:-1] + bytes((chunk.blob[-1] ^ 1,)))
+
+
 @given(st.data(), st.booleans())
 def test_any_change_of_a_chunk_is_noticed(data: st.DataObject, is_large: bool) -> None:
     (chunk,) = encode_captures([frame(n) for n in range(5)])
