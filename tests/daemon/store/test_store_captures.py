@@ -106,7 +106,7 @@ def test_a_frame_that_no_bus_can_carry_is_refused_by_name() -> None:
 
 def test_a_damaged_chunk_is_told_with_what_to_do() -> None:
     (chunk,) = encode_captures([frame(0)])
-    with pytest.raises(StoreError, match="is damaged .*; restore the store from a backup"):
+    with pytest.raises(StoreError, match=r"is damaged .*; restore the store from a backup"):
         decode_captures(chunk.blob[:-1] + bytes((chunk.blob[-1] ^ 1,)))
 
 
